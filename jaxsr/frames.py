@@ -1,0 +1,79 @@
+"""The conventions, and the three small pytrees that carry them. Nothing else in jaxsr defines any.
+
+Arrays are channels-last: images `[H, W, C]`, batches `[B, H, W, C]`, float32.
+
+Pixels: x points right, y points down, integers are pixel centres. A point at `x_hr` in an image that
+is `s` times larger lies at `x_lr = (x_hr + 0.5) / s - 0.5`. Vectors of pixels are (x, y).
+
+Motion is backward, in pixels of its own image, and knows nothing of jitter: `p_prev = p - motion_px`.
+
+Jitter J is in pixels of the low-resolution (LR) image, in [-0.5, 0.5]. The jittered image shows at p what
+the unjittered one has at p + J: `I_J(p) = I_N(p + J)`. High-resolution (HR) buffers are not jittered.
+
+Colour is scene-linear and unbounded. Depth is linear view depth (distance along the viewing axis), +inf
+for sky. Normals are unit vectors in world space, zero for sky. Base colour is 0 for sky.
+
+View space: x right, y down, z forward. World space: whatever the scene has, right-handed.
+
+Names carry the unit or the space where there is doubt: `motion_px`, `depth_linear`, `color_linear`.
+"""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Bool, Float
+
+
+
+class Camera(NamedTuple):
+    """A pinhole camera, independent of any resolution.
+
+    A view-space point (x, y, z) projects to `ndc = (x, y) / (z * tan_half_fov) - lens_shift` in [-1, 1],
+    x right and y down, and to pixels by `p = (ndc + 1) / 2 * (W, H) - 0.5`.
+    """
+
+    world_from_view: Float[Array, "*b 4 4"]
+    """Rigid transform from view space to world space."""
+    tan_half_fov: Float[Array, "*b 2"]
+    """Tangents of half the horizontal and half the vertical field of view."""
+    lens_shift: Float[Array, "*b 2"]
+    """Offset of the optical axis, in units of half the image; zero for an ordinary lens."""
+
+
+class GBuffer(NamedTuple):
+    """What a rasteriser knows about each pixel before shading. A buffer that was not exported is None."""
+
+    depth_linear: Float[Array, "*b h w 1"]
+    motion_px: Float[Array, "*b h w 2"]
+    normal: Float[Array, "*b h w 3"] | None = None
+    base_color: Float[Array, "*b h w 3"] | None = None
+    roughness: Float[Array, "*b h w 1"] | None = None
+    metallic: Float[Array, "*b h w 1"] | None = None
+    object_id: Float[Array, "*b h w 1"] | None = None
+    """Whole numbers; 0 for sky."""
+
+
+class Frame(NamedTuple):
+    """All that a method may see of one frame. The truth is not part of it.
+
+    `color_linear` is zero where `rendered` is False: such a frame has only its G-buffers and must be
+    extrapolated. The HR size is a whole multiple of the LR size; at scale 1 the two G-buffers are equal.
+    """
+
+    color_linear: Float[Array, "*b h w 3"]
+    """The jittered LR render."""
+    lr: GBuffer
+    """Jittered, at the size of `color_linear`."""
+    hr: GBuffer
+    """Unjittered, at the size of the output."""
+    jitter_px: Float[Array, "*b 2"]
+    """J of this frame, in LR pixels."""
+    camera: Camera
+    cut: Bool[Array, "*b"]
+    """True where this frame does not continue the one before it: history must be dropped."""
+    rendered: Bool[Array, "*b"]
+    """False where the frame was never shaded."""
+
+    @property
+    def scale(self) -> int:
+        """HR size divided by LR size."""
+        return self.hr.depth_linear.shape[-3] // self.color_linear.shape[-3]

@@ -1,0 +1,20 @@
+"""Strictness for every test: two CPU devices, no silent broadcasting or promotion, shapes checked."""
+
+import os
+
+os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_platform_device_count=2"
+
+from jaxtyping import install_import_hook
+
+install_import_hook("jaxsr", "beartype.beartype")
+
+import hypothesis
+import jax
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+hypothesis.settings.register_profile(
+    "jaxsr", deadline=None, max_examples=15, derandomize=True, suppress_health_check=list(hypothesis.HealthCheck)
+)
+hypothesis.settings.load_profile("jaxsr")
