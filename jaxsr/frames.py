@@ -23,7 +23,6 @@ from typing import NamedTuple
 from jaxtyping import Array, Bool, Float
 
 
-
 class Camera(NamedTuple):
     """A pinhole camera, independent of any resolution.
 

@@ -8,13 +8,17 @@ from jaxtyping import install_import_hook
 
 install_import_hook("jaxsr", "beartype.beartype")
 
-import hypothesis
-import jax
+import hypothesis  # noqa: E402
+import jax  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 
 hypothesis.settings.register_profile(
-    "jaxsr", deadline=None, max_examples=15, derandomize=True, suppress_health_check=list(hypothesis.HealthCheck)
+    "jaxsr",
+    deadline=None,
+    max_examples=15,
+    derandomize=True,
+    suppress_health_check=list(hypothesis.HealthCheck),
 )
 hypothesis.settings.load_profile("jaxsr")
