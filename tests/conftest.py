@@ -6,7 +6,7 @@ os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_p
 
 from jaxtyping import install_import_hook
 
-install_import_hook("jaxsr", "beartype.beartype")
+install_import_hook("jaxsr", "tests.typecheck.check")
 
 import hypothesis  # noqa: E402
 import jax  # noqa: E402
