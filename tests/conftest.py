@@ -6,6 +6,8 @@ os.environ["XLA_FLAGS"] = os.environ.get("XLA_FLAGS", "") + " --xla_force_host_p
 
 from jaxtyping import install_import_hook
 
+import tests.typecheck  # noqa: F401 (the hook finds it by name)
+
 install_import_hook("jaxsr", "tests.typecheck.check")
 
 import hypothesis  # noqa: E402
