@@ -336,10 +336,9 @@ def key_matrices(ob: bpy.types.Object, matrices: Sequence[Matrix], first: int = 
         rotations.append(rotation)
         scales.append(scale)
     ob.location, ob.rotation_quaternion, ob.scale = locations[0], rotations[0], scales[0]
-    key_values(ob, "location", locations, first)
-    key_values(ob, "rotation_quaternion", rotations, first)
-    if any((scale - scales[0]).length > 1e-6 for scale in scales):
-        key_values(ob, "scale", scales, first)
+    for path, values in (("location", locations), ("rotation_quaternion", rotations), ("scale", scales)):
+        if any((Vector(value) - Vector(values[0])).length > 1e-7 for value in values):
+            key_values(ob, path, values, first)
 
 
 def key_motion(ob: bpy.types.Object, frames: int, matrix_at: Callable[[int], Matrix]) -> None:
@@ -367,8 +366,7 @@ def key_values(
         for number, value in enumerate(values):
             flat += [first + number, value if scalar else value[index]]
         curve.keyframe_points.foreach_set("co", flat)
-        for point in curve.keyframe_points:
-            point.interpolation = "LINEAR"
+        curve.keyframe_points.foreach_set("interpolation", [1] * len(values))  # linear
         curve.update()
 
 
