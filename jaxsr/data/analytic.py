@@ -195,9 +195,9 @@ def render(
         depth_before > 0
     )
     back_origin: Any = before.world_from_view[:3, 3]
-    back_distance, _ = _nearest(objects, back_origin, past - back_origin, then)
-    visible = inside & (~hit | (back_distance > 1 - 1e-4))
-    visible &= hit | ~np.isfinite(back_distance)
+    back_rays = np.where(hit[..., None], past - back_origin, rays)
+    back_distance, _ = _nearest(objects, back_origin, back_rays, then)
+    visible = inside & np.where(hit, back_distance > 1 - 1e-4, ~np.isfinite(back_distance))
     layers = {
         "color": color,
         "depth": np.where(hit, depth_now, np.inf)[..., None],
