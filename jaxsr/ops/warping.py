@@ -1,0 +1,219 @@
+"""Backward warping, forward splatting, and occlusion motion vectors.
+
+All three follow the convention of `jaxsr.frames`: motion is backward and in pixels of its own image, so
+that the point seen at p lies at `p - motion_px(p)` in the previous frame. Warping reads there; splatting
+writes there. Images are `[H, W, C]` or `[B, H, W, C]`; values have no range, results keep the dtype.
+
+Whole pixels and fractions are split on the motion itself, not on `p - motion_px`: a uniform motion then
+means the same thing at every pixel, also thousands of pixels from the origin. Motion of any size is fine;
+a NaN component of the motion counts as 0 (and gets no gradient), an infinite one points outside the image.
+
+No guide, no hole filling: that is `jaxsr.ops.reprojection`.
+"""
+
+import functools
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxsr.errors import JaxsrError
+from jaxsr.ops._batch import over_batch
+
+Mode = Literal["bilinear", "nearest", "bicubic"]
+Boundary = Literal["clamp", "zero"]
+
+
+@functools.partial(jax.jit, static_argnames=("mode", "boundary"))
+def backward_warp(
+    image: Float[Array, "*b h w c"],
+    motion_px: Float[Array, "*b h w 2"],
+    *,
+    mode: Mode = "bilinear",
+    boundary: Boundary = "clamp",
+) -> Float[Array, "*b h w c"]:
+    """Read `image` where each pixel came from: `out(p) = image(p - motion_px(p))`.
+
+    `"bicubic"` is Keys' kernel with a = -0.5, that is Catmull-Rom: the history filter of temporal
+    anti-aliasing (Jimenez 2016); OpenCV and PyTorch use a = -0.75. It overshoots at edges. `"clamp"`
+    repeats the border pixels; under `"zero"` every tap outside the image contributes 0. An infinite
+    pixel makes NaN of its bilinear and bicubic neighbours: warp depth with `"nearest"`.
+
+    Differentiable in `image` and, unless the mode is `"nearest"` (half to even), in `motion_px`.
+
+    Args:
+        image: the previous frame, any range.
+        motion_px: backward motion (x, y) in pixels of `image`.
+        mode: interpolation.
+        boundary: what lies outside the image.
+
+    Raises:
+        JaxsrError: unknown mode or boundary, or sizes that do not agree.
+    """
+    if mode not in ("bilinear", "nearest", "bicubic"):
+        raise JaxsrError(
+            "unknown mode", where="backward_warp", expected="bilinear, nearest or bicubic", found=mode
+        )
+    if boundary not in ("clamp", "zero"):
+        raise JaxsrError("unknown boundary", where="backward_warp", expected="clamp or zero", found=boundary)
+    _check_sizes("backward_warp", image, motion_px)
+    return over_batch(functools.partial(_warp, mode=mode, boundary=boundary), image, motion_px)
+
+
+@jax.jit
+def forward_splat(
+    values: Float[Array, "*b h w c"],
+    motion_px: Float[Array, "*b h w 2"],
+    depth_linear: Float[Array, "*b h w 1"],
+) -> tuple[Float[Array, "*b h w c"], Bool[Array, "*b h w 1"]]:
+    """Write each pixel's value where it came from; the nearest one wins.
+
+    Pixel q lands whole on `q - round(motion_px(q))`. Among those that land on one pixel the smallest
+    depth wins, and among equal depths the first in row order: the result is deterministic. What lands
+    outside the image is lost. NaN depth counts as +inf. To carry a frame forward in time, give the
+    negated motion.
+
+    Differentiable in `values` only.
+
+    Args:
+        values: what is carried, any range.
+        motion_px: backward motion (x, y) in pixels.
+        depth_linear: linear view depth, +inf for sky.
+
+    Returns:
+        The splatted values, 0 where nothing landed, and a mask that is True where something did.
+
+    Raises:
+        JaxsrError: sizes that do not agree.
+    """
+    _check_sizes("forward_splat", values, motion_px, depth_linear)
+
+    def splat(v: Array, motion: Array, depth: Array) -> tuple[Array, Array]:
+        h, w, c = v.shape
+        winner = _nearest_arrival(_origin(motion), depth)
+        landed = winner < h * w
+        rows = v.reshape(-1, c)[jnp.minimum(winner, h * w - 1)]
+        return jnp.where(landed[:, None], rows, 0).reshape(h, w, c), landed.reshape(h, w, 1)
+
+    return over_batch(splat, values, motion_px, depth_linear)
+
+
+@jax.jit
+def occlusion_motion(
+    motion_px: Float[Array, "*b h w 2"], depth_linear: Float[Array, "*b h w 1"]
+) -> Float[Array, "*b h w 2"]:
+    """Occlusion motion: at disoccluded pixels the motion of the occluder, elsewhere the motion itself.
+
+    The motion of a disoccluded pixel p points at the surface that hid it, and a warp shows its ghost.
+    Zeng et al. 2021 (dual motion vectors) move p along with that occluder instead, so that p reads the
+    background beside it. In ExtraNet's form (Guo et al. 2021): splat the current frame's motion into the
+    previous frame with a depth test, and read it at the motion's origin,
+
+        MV_occ(p) = MV(q*),   q* = argmin depth(q) over { q : q - round(MV(q)) = p - round(MV(p)) }.
+
+    p itself is one of the q, so a pixel that nothing hid keeps its motion. Where the origin lies outside
+    the image the motion is returned unchanged. Depths are those of the current frame.
+
+    Args:
+        motion_px: backward motion (x, y) in pixels.
+        depth_linear: linear view depth, +inf for sky.
+
+    Returns:
+        Backward motion in pixels, for `backward_warp`. Differentiable in `motion_px` (as a gather).
+
+    Raises:
+        JaxsrError: sizes that do not agree.
+    """
+    _check_sizes("occlusion_motion", motion_px, depth_linear)
+
+    def occlude(motion: Array, depth: Array) -> Array:
+        h, w, _ = motion.shape
+        origin = _origin(motion)
+        winner = _nearest_arrival(origin, depth)[jnp.minimum(origin, h * w - 1)]
+        chosen = jnp.where(origin < h * w, winner, jnp.arange(h * w))
+        return motion.reshape(-1, 2)[chosen].reshape(h, w, 2)
+
+    return over_batch(occlude, motion_px, depth_linear)
+
+
+def _check_sizes(where: str, *arrays: Array) -> None:
+    """All arrays must agree but for the channels: jaxtyping says so only when it is switched on."""
+    if len({a.shape[:-1] for a in arrays}) != 1:
+        raise JaxsrError(
+            "image sizes differ", where=where, expected="equal [.., H, W]", found=[a.shape for a in arrays]
+        )
+
+
+def _whole_and_fraction(
+    offset: Float[Array, "h w"], size: int, rounding: Literal["floor", "round"]
+) -> tuple[Int[Array, "h w"], Float[Array, "h w"]]:
+    """Split an offset along one axis; beyond the reach of the image it is clipped, which changes nothing."""
+    reach = size + 4  # past the last tap of any kernel, and small enough for exact float32 fractions
+    offset = jnp.clip(jnp.where(jnp.isnan(offset), 0, offset), -reach, reach)
+    whole = jax.lax.stop_gradient(jnp.floor(offset) if rounding == "floor" else jnp.round(offset))
+    return whole.astype(jnp.int32), offset - whole
+
+
+def _kernel(mode: Mode, f: Float[Array, "h w"]) -> dict[int, Float[Array, "h w"]]:
+    """Weights of the taps at whole offsets, for a sample at fraction f in [0, 1) past tap 0."""
+    if mode == "bilinear":
+        return {0: 1 - f, 1: f}
+    # Keys 1981, eq. (8), a = -1/2; Horner form.
+    return {
+        -1: ((-0.5 * f + 1.0) * f - 0.5) * f,
+        0: (1.5 * f - 2.5) * f * f + 1.0,
+        1: ((-1.5 * f + 2.0) * f + 0.5) * f,
+        2: (0.5 * f - 0.5) * f * f,
+    }
+
+
+def _warp(image: Array, motion: Array, *, mode: Mode, boundary: Boundary) -> Array:
+    h, w, c = image.shape
+    if image.size == 0:
+        return image
+    rounding: Literal["floor", "round"] = "round" if mode == "nearest" else "floor"
+    dx, fx = _whole_and_fraction(-motion[..., 0], w, rounding)
+    dy, fy = _whole_and_fraction(-motion[..., 1], h, rounding)
+    x0, y0 = jnp.arange(w)[None, :] + dx, jnp.arange(h)[:, None] + dy
+
+    # Rows of channels are gathered whole: planar gathers are several times slower.
+    pixels = image.reshape(h * w, c)
+
+    def tap(ky: int, kx: int) -> Array:
+        x, y = x0 + kx, y0 + ky
+        index = jnp.clip(y, 0, h - 1) * w + jnp.clip(x, 0, w - 1)
+        value = pixels.at[index].get(mode="promise_in_bounds")
+        if boundary == "clamp":
+            return value
+        inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
+        return jnp.where(inside[..., None], value, 0)
+
+    if mode == "nearest":
+        return tap(0, 0)
+    rows = []
+    for ky, wy in _kernel(mode, fy).items():
+        row = [wx[..., None] * tap(ky, kx) for kx, wx in _kernel(mode, fx).items()]
+        rows.append(wy[..., None] * functools.reduce(jnp.add, row))
+    return functools.reduce(jnp.add, rows)
+
+
+def _origin(motion: Float[Array, "h w 2"]) -> Int[Array, " n"]:
+    """Row-order index of `p - round(motion(p))` for every p; H * W where that lies outside the image."""
+    h, w, _ = motion.shape
+    dx, _ = _whole_and_fraction(-motion[..., 0], w, "round")
+    dy, _ = _whole_and_fraction(-motion[..., 1], h, "round")
+    x, y = jnp.arange(w)[None, :] + dx, jnp.arange(h)[:, None] + dy
+    inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
+    return jnp.where(inside, y * w + x, h * w).reshape(-1)
+
+
+def _nearest_arrival(target: Int[Array, " n"], depth: Float[Array, "h w 1"]) -> Int[Array, " n"]:
+    """For every pixel the index of the nearest one that lands on it, or N. Two min-scatters: no races."""
+    n = target.shape[0]
+    z = jax.lax.stop_gradient(depth).reshape(n)
+    z = jnp.where(jnp.isnan(z), jnp.inf, z)
+    nearest = jnp.full(n, jnp.inf, z.dtype).at[target].min(z, mode="drop")
+    wins = z == nearest.at[target].get(mode="fill", fill_value=jnp.nan)
+    arrivals = jnp.where(wins, target, n)
+    return jnp.full(n, n).at[arrivals].min(jnp.arange(n), mode="drop")
