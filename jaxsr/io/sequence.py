@@ -1,0 +1,363 @@
+"""Reading a sequence: frames as the pytrees of `jaxsr.frames`, of NumPy float32 arrays.
+
+The format is described in docs/data.md; `SequenceWriter` and `FrameInfo` (from `jaxsr.io.writing`) make one.
+Opening reads `sequence.json` and checks that the files it lists are there, and no others; pixels are read,
+and checked, frame by frame. Nothing but the description is kept in memory. Reading is safe from threads.
+"""
+
+import itertools
+import json
+import queue
+import threading
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsr.errors import JaxsrError
+from jaxsr.frames import Frame, GBuffer
+from jaxsr.io.exr import read_exr, read_exr_header
+from jaxsr.io.writing import FORMAT, LAYERS, VERSION, FrameInfo, SequenceWriter, frame_file
+
+__all__ = ["FrameInfo", "Sequence", "SequenceWriter", "prefetch"]
+
+T = TypeVar("T")
+
+
+class Sequence:
+    """A sequence on disk. Open one with `Sequence.open(path)`.
+
+    Attributes:
+        path, name, size (HR `(W, H)`), scales, fps, exposure, license, generator, infos (one FrameInfo a
+        frame), check (whether pixels are searched for NaN and Inf).
+    """
+
+    def __init__(self, path: Path, head: dict[str, Any], infos: list[FrameInfo], check: bool):
+        self.path, self.infos, self.check = path, infos, check
+        self.name: str = head.get("name", path.name)
+        self.size: tuple[int, int] = (head["size"][0], head["size"][1])
+        self.scales: tuple[int, ...] = tuple(head["scales"])
+        self.fps: float = float(head.get("fps", 24.0))
+        self.exposure: float = float(head.get("exposure", 1.0))
+        self.license: str = head.get("license", "")
+        self.generator: dict[str, Any] = head.get("generator", {})
+
+    @classmethod
+    def open(cls, path: str | Path, *, check: bool = True) -> "Sequence":
+        """Read the description and see that its files are there.
+
+        Args:
+            path: the folder, or its `sequence.json`.
+            check: search the pixels that are read for NaN and Inf (depth may be +inf).
+
+        Raises:
+            JaxsrError: not a sequence, bad JSON, another version, or files that do not match the list.
+        """
+        path = Path(path)
+        path = path.parent if path.name == "sequence.json" else path
+        head = _read_head(path)
+        infos = [_frame_info(entry, k, path) for k, entry in enumerate(head["frames"])]
+        for a, b in itertools.pairwise(infos):
+            if b.index <= a.index or (b.index != a.index + 1 and not b.cut):
+                raise JaxsrError(
+                    f"frame {b.index} follows frame {a.index}",
+                    where=path / "sequence.json",
+                    expected='consecutive frames, or "cut": true where the sequence is interrupted',
+                )
+        seq = cls(path, head, infos, check)
+        for resolution in seq.resolutions:
+            _check_files(path / resolution, [i.index for i in infos])
+        return seq
+
+    def __len__(self) -> int:
+        return len(self.infos)
+
+    @property
+    def resolutions(self) -> tuple[str, ...]:
+        """Folders of frames: "hr", "x2", ..."""
+        return ("hr", *(f"x{s}" for s in self.scales if s > 1))
+
+    def layers(self, resolution: str, i: int = 0) -> tuple[str, ...]:
+        """The layers that frame number `i` of the list has in "hr", "x2", ... (from the header alone)."""
+        path = frame_file(self.path, self._resolution(resolution), self._info(i).index)
+        names = set(read_exr_header(path)[0])
+        return tuple(n for n, cs in LAYERS.items() if all(f"{n}.{c}" in names for c in cs))
+
+    def frame(self, i: int, scale: int, rendered: bool = True) -> Frame:
+        """The frame at position `i` of the list, as NumPy arrays.
+
+        Args:
+            i: 0 .. len - 1.
+            scale: one of `scales`; or 1: the HR images are then also the LR ones, and the jitter is 0.
+            rendered: False gives a frame without colour (zeros), whose colour was not looked at.
+
+        Raises:
+            JaxsrError: no such frame or scale, or a file that is missing, damaged or lacks a layer.
+        """
+        info = self._info(i)
+        resolution = self._resolution("hr" if scale == 1 else f"x{scale}")
+        skip = () if rendered else ("color",)
+        lr = self._read(i, resolution, skip=("position", *skip), need=("depth", "motion"))
+        hr = lr if scale == 1 else self._read(i, "hr", skip=("position", "color"), need=("depth", "motion"))
+        h, w = lr["depth"].shape[:2]
+        if rendered and "color" not in lr:
+            raise self._missing(i, resolution, "color", lr)
+        color = lr["color"] if rendered else np.zeros((h, w, 3), np.float32)
+        jitter = (0.0, 0.0) if scale == 1 else info.jitter_px
+        return Frame(
+            color_linear=color,  # type: ignore[arg-type]
+            lr=_gbuffer(lr),
+            hr=_gbuffer(hr),
+            jitter_px=np.asarray(jitter, np.float32),  # type: ignore[arg-type]
+            camera=info.camera,
+            cut=np.asarray(info.cut),  # type: ignore[arg-type]
+            rendered=np.asarray(rendered),  # type: ignore[arg-type]
+        )
+
+    def truth(self, i: int) -> Float[np.ndarray, "H W 3"]:
+        """The HR colour, scene-linear."""
+        return self._read(i, "hr", only=("color",), need=("color",))["color"]
+
+    def position(self, i: int, scale: int | str) -> Float[np.ndarray, "h w 3"]:
+        """World position of every pixel of an LR scale or of "hr" (what the jittered pixel sees); 0 for sky.
+
+        Taken from the file, or rebuilt from depth and camera where the file has none.
+        """
+        resolution = self._resolution("hr" if scale in ("hr", 1) else f"x{scale}")
+        layers = self._read(i, resolution, only=("position", "depth"), need=("depth",))
+        if "position" in layers:
+            return layers["position"]
+        info = self._info(i)
+        jitter = (0.0, 0.0) if resolution == "hr" else info.jitter_px
+        return world_position(layers["depth"], info, jitter)
+
+    def _info(self, i: int) -> FrameInfo:
+        if not 0 <= i < len(self.infos):
+            raise JaxsrError("no such frame", where=self.path, expected=f"0 to {len(self) - 1}", found=i)
+        return self.infos[i]
+
+    def _resolution(self, resolution: str) -> str:
+        if resolution not in self.resolutions:
+            raise JaxsrError(
+                f"scale {resolution.lstrip('x')} is not available",
+                where=self.path,
+                expected=f"one of {[1, *(s for s in self.scales if s > 1)]}",
+                fix="render the sequence at that scale, or choose one of these",
+            )
+        return resolution
+
+    def _missing(self, i: int, resolution: str, layer: str, found: Iterable[str]) -> JaxsrError:
+        index = self.infos[i].index
+        return JaxsrError(
+            f"frame {index}: missing layer {layer!r}",
+            where=frame_file(self.path, resolution, index),
+            expected="channels " + ", ".join(f"{layer}.{c}" for c in LAYERS[layer]),
+            found="layers " + (", ".join(found) or "none"),
+            fix="export it (docs/data.md)",
+        )
+
+    def _read(
+        self,
+        i: int,
+        resolution: str,
+        *,
+        only: tuple[str, ...] = tuple(LAYERS),
+        skip: tuple[str, ...] = (),
+        need: tuple[str, ...] = (),
+    ) -> dict[str, np.ndarray]:
+        index = self._info(i).index
+        path = frame_file(self.path, resolution, index)
+        channels, _ = read_exr(path, pad=False)
+        layers = {}
+        for layer, letters in LAYERS.items():
+            names = [f"{layer}.{c}" for c in letters]
+            absent = [n for n in names if n not in channels]
+            if layer not in only or layer in skip or len(absent) == len(names):
+                continue
+            if absent:
+                raise JaxsrError(
+                    f"frame {index}: layer {layer!r} lacks channel {absent[0]!r}",
+                    where=path,
+                    expected=", ".join(names),
+                    found=", ".join(sorted(channels)),
+                )
+            layers[layer] = np.stack([channels[n].astype(np.float32) for n in names], -1)
+        for layer in need:
+            if layer not in layers:
+                raise self._missing(
+                    i, resolution, layer, dict.fromkeys(n.rpartition(".")[0] or n for n in channels)
+                )
+        scale = 1 if resolution == "hr" else int(resolution[1:])
+        expected = (self.size[1] // scale, self.size[0] // scale)
+        for layer, x in layers.items():
+            if x.shape[:2] != expected:
+                raise JaxsrError(
+                    f"frame {index}: layer {layer!r} has the wrong size",
+                    where=path,
+                    expected=f"{expected[1]}x{expected[0]} (HR {self.size[0]}x{self.size[1]}, scale {scale})",
+                    found=f"{x.shape[1]}x{x.shape[0]}",
+                    fix="render it again, or correct size and scales in sequence.json",
+                )
+            if self.check:
+                _check_finite(layer, x, index, path)
+        return layers
+
+
+def world_position(
+    depth_linear: Float[np.ndarray, "h w 1"], info: FrameInfo, jitter_px: tuple[float, float] = (0.0, 0.0)
+) -> Float[np.ndarray, "h w 3"]:
+    """World position of what each pixel sees, from linear depth (frames.Camera inverted); 0 for sky."""
+    h, w = depth_linear.shape[:2]
+    y, x = np.mgrid[0:h, 0:w].astype(np.float64)
+    p = np.stack([x + jitter_px[0], y + jitter_px[1]], -1)
+    ndc = (p + 0.5) / (w, h) * 2 - 1
+    z = np.where(np.isfinite(depth_linear), depth_linear, 0).astype(np.float64)
+    xy = (ndc + np.asarray(info.lens_shift)) * np.asarray(info.tan_half_fov) * z
+    matrix = np.asarray(info.world_from_view, np.float64)
+    world = np.concatenate([xy, z], -1) @ matrix[:3, :3].T + matrix[:3, 3]
+    return np.where(np.isfinite(depth_linear), world, 0).astype(np.float32)
+
+
+def prefetch(items: Iterable[T], depth: int = 2) -> Iterator[T]:
+    """Run an iterator in a thread, `depth` items ahead: files are decoded while the last item is used.
+
+    `for frame in prefetch(seq.frame(i, 2) for i in range(len(seq))): ...`. Errors arrive where the item would
+    have been. Leaving the loop early stops the thread.
+    """
+    ready: queue.Queue[tuple[bool, Any]] = queue.Queue(maxsize=depth)
+    stop = threading.Event()
+
+    def put(item: tuple[bool, Any]) -> None:
+        while not stop.is_set():
+            try:
+                return ready.put(item, timeout=0.1)
+            except queue.Full:
+                continue
+
+    def work() -> None:
+        try:
+            for item in items:
+                put((True, item))
+                if stop.is_set():
+                    return
+            put((False, None))
+        except BaseException as e:  # handed to the consumer, who raises it
+            put((False, e))
+
+    thread = threading.Thread(target=work, name="prefetch", daemon=True)
+    thread.start()
+    try:
+        while True:
+            more, item = ready.get()
+            if more:
+                yield item
+            elif item is None:
+                return
+            else:
+                raise item
+    finally:
+        stop.set()
+        thread.join()
+
+
+def _gbuffer(layers: dict[str, np.ndarray]) -> GBuffer:
+    names = {"depth_linear": "depth", "motion_px": "motion"}
+    return GBuffer(**{f: layers.get(names.get(f, f)) for f in GBuffer._fields})  # type: ignore[arg-type]
+
+
+def _read_head(path: Path) -> dict[str, Any]:
+    file = path / "sequence.json"
+    if not path.is_dir():
+        raise JaxsrError("no such folder", where=path, expected="a sequence")
+    if not file.is_file():
+        strays = next(iter(sorted(path.rglob("*.exr"))), None)
+        raise JaxsrError(
+            "not a sequence",
+            where=path,
+            expected="a file sequence.json",
+            found="none" if strays is None else f"another layout ({strays.relative_to(path)})",
+            fix="docs/data.md says how to make one",
+        )
+    try:
+        head = json.loads(file.read_text(encoding="utf-8"))
+    except ValueError as e:
+        raise JaxsrError(
+            "bad JSON", where=file, found=e, fix="correct it, or write the sequence again"
+        ) from e
+    if not isinstance(head, dict) or head.get("format") != FORMAT:
+        found = head.get("format") if isinstance(head, dict) else type(head).__name__
+        raise JaxsrError("not a sequence", where=file, expected=f'"format": "{FORMAT}"', found=found)
+    if head.get("version") != VERSION:
+        raise JaxsrError(
+            "unsupported version of the format",
+            where=file,
+            expected=VERSION,
+            found=head.get("version"),
+            fix="update jaxsr, or write the sequence again",
+        )
+    size, scales = head.get("size"), head.get("scales")
+    if not (isinstance(size, list) and len(size) == 2 and all(isinstance(n, int) and n > 0 for n in size)):
+        raise JaxsrError("bad size", where=file, expected="two whole numbers, [W, H]", found=size)
+    if not (isinstance(scales, list) and all(isinstance(s, int) and s > 0 for s in scales)):
+        raise JaxsrError("bad scales", where=file, expected="a list of whole numbers", found=scales)
+    for s in scales:
+        if size[0] % s or size[1] % s:
+            raise JaxsrError(f"scale {s} does not divide the size", where=file, found=f"{size[0]}x{size[1]}")
+    if not isinstance(head.get("frames"), list) or not head["frames"]:
+        raise JaxsrError("no frames", where=file, expected='"frames": a list of at least one frame')
+    return head
+
+
+def _frame_info(entry: Any, k: int, path: Path) -> FrameInfo:
+    try:
+        camera = entry["camera"]
+        info = FrameInfo(
+            index=int(entry["index"]),
+            jitter_px=tuple(np.asarray(entry["jitter_px"], float).reshape(2).tolist()),
+            cut=bool(entry["cut"]),
+            world_from_view=np.asarray(camera["world_from_view"], float).reshape(4, 4),
+            tan_half_fov=tuple(np.asarray(camera["tan_half_fov"], float).reshape(2).tolist()),
+            lens_shift=tuple(np.asarray(camera.get("lens_shift", [0, 0]), float).reshape(2).tolist()),
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as e:
+        raise JaxsrError(
+            f"entry {k} of frames is not right",
+            where=path / "sequence.json",
+            expected="index, jitter_px, cut, camera (world_from_view, tan_half_fov, lens_shift)",
+            found=f"missing {e}" if isinstance(e, KeyError) else e,
+        ) from e
+    numbers = np.concatenate([np.ravel(x) for x in (info.jitter_px, info.world_from_view, info.tan_half_fov)])
+    if not np.isfinite(numbers).all():
+        raise JaxsrError(f"frame {info.index}: camera or jitter is not finite", where=path / "sequence.json")
+    return info
+
+
+def _check_files(folder: Path, indices: list[int]) -> None:
+    listed = {frame_file(folder.parent, folder.name, i).name for i in indices}
+    there = {p.name for p in folder.glob("*.exr") if not p.name.startswith(".")} if folder.is_dir() else set()
+    if listed == there:
+        return
+    absent, extra = sorted(listed - there), sorted(there - listed)
+    raise JaxsrError(
+        f"file {absent[0]} is missing" if absent else f"file {extra[0]} is not in sequence.json",
+        where=folder,
+        expected=f"{len(listed)} frames as sequence.json lists them",
+        found=f"{len(there)} files" if folder.is_dir() else "no such folder",
+        fix="let the writer finish (it resumes), or correct sequence.json",
+    )
+
+
+def _check_finite(layer: str, x: np.ndarray, index: int, path: Path) -> None:
+    bad = np.isnan(x) | np.isneginf(x) if layer == "depth" else ~np.isfinite(x)
+    if not bad.any():
+        return
+    y, px, c = (int(n) for n in np.argwhere(bad)[0])
+    raise JaxsrError(
+        f"frame {index}: layer {layer!r} holds NaN or Inf",
+        where=path,
+        expected="finite numbers, or +inf for sky" if layer == "depth" else "finite numbers",
+        found=f"{int(bad.any(-1).sum())} pixels, the first x={px} y={y} ({layer}.{LAYERS[layer][c]})",
+        fix="render it again, or open the sequence with check=False",
+    )
