@@ -10,7 +10,6 @@ NaN pixel reaches only the results that give it a weight: depth +inf for sky doe
 """
 
 import functools
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -271,7 +270,7 @@ def depth_to_space(image: Float[Array, "*b h w c"], block: int) -> Float[Array, 
 def sample_jittered(
     image: Float[Array, "*b h w c"],
     jitter_px: Float[Array, "*b 2"],
-    size: Sequence[int],
+    size: tuple[int, int],
     mode: str = "bilinear",
     boundary: str = "clamp",
 ) -> Float[Array, "*b h2 w2 c"]:

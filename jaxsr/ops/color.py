@@ -1,0 +1,135 @@
+"""Tone curves, sRGB, YCoCg, luminance, and DISPLAY: the display-referred colour of jaxsr.
+
+Scene-linear colour is unbounded. DISPLAY colour is `sRGB(clip(ACES(exposure * linear)))` in [0, 1]: metrics,
+perceptual losses and written images see no other. ACES is Narkowicz' fit of the filmic curve. Primaries are
+those of sRGB throughout; no gamut is converted.
+
+Out of range: below 0 counts as 0 with no gradient (the curves are one-sided, with their right derivative
+at 0), +inf as very large, and NaN stays NaN, so that a broken pixel is seen and not hidden. Gradients are
+finite at 0 and at any finite value.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsr.errors import JaxsrError
+
+KINDS = ("aces", "reinhard", "log")
+
+_ACES_WHITE = 7.2416735
+"""Linear value at which the fit reaches 1: the positive root of 0.08 x^2 - 0.56 x - 0.14."""
+
+
+def _floor(x: Array, low: float = 0.0) -> Array:
+    # Unlike maximum: the whole gradient at the bound itself, where black pixels are, and NaN is kept.
+    return jnp.where(x < low, low, x)
+
+
+def _ceil(x: Array, high: float) -> Array:
+    return jnp.where(x > high, high, x)
+
+
+def _check_kind(kind: str) -> None:
+    if kind not in KINDS:
+        raise JaxsrError("unknown tone curve", where="kind", expected=" | ".join(KINDS), found=kind)
+
+
+@functools.partial(jax.jit, static_argnames=("kind",))
+def tone_map(color_linear: Float[Array, "*n"], kind: str = "aces") -> Float[Array, "*n"]:
+    """Compress scene-linear values, channel by channel.
+
+    "aces": `x (2.51 x + 0.03) / (x (2.43 x + 0.59) + 0.14)` clipped to [0, 1] (Narkowicz 2016), 1 from
+    x = 7.24 on. "reinhard": `x / (1 + x)` in [0, 1]. "log": `log(1 + x)`, unbounded (the tone of ExtraNet).
+
+    Raises:
+        JaxsrError: unknown kind.
+    """
+    _check_kind(kind)
+    x = _floor(color_linear)
+    if kind == "aces":
+        x = _ceil(x, _ACES_WHITE)
+        return _ceil(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0)
+    if kind == "reinhard":
+        # The second form does not overflow, the first keeps the precision of dark values.
+        return jnp.where(x > 1, 1 / (1 + 1 / _floor(x, 1.0)), x / (1 + _ceil(x, 1.0)))
+    return jnp.log1p(x)
+
+
+@functools.partial(jax.jit, static_argnames=("kind",))
+def inverse_tone_map(toned: Float[Array, "*n"], kind: str = "aces") -> Float[Array, "*n"]:
+    """The inverse of `tone_map`, finite everywhere.
+
+    Values at or above saturation give the largest value that the curve can tell apart: 7.24 for "aces",
+    1e6 for "reinhard"; "log" stops at exp(60).
+
+    Raises:
+        JaxsrError: unknown kind.
+    """
+    _check_kind(kind)
+    y = _floor(toned)
+    if kind == "aces":
+        y = _ceil(y, 1.0)
+        # (2.51 - 2.43 y) x^2 + (0.03 - 0.59 y) x - 0.14 y = 0, in the form without cancellation.
+        a, b, c = 2.51 - 2.43 * y, 0.03 - 0.59 * y, 0.14 * y
+        root = jnp.sqrt(b * b + 4 * a * c)
+        return jnp.where(b > 0, 2 * c / (_floor(b) + root), (root - b) / (2 * a))
+    if kind == "reinhard":
+        y = _ceil(y, 1 - 1e-6)
+        return y / (1 - y)
+    return jnp.expm1(_ceil(y, 60.0))
+
+
+@jax.jit
+def srgb_from_linear(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The sRGB transfer function, IEC 61966-2-1, exact in both pieces; not clipped above 1."""
+    x = _floor(linear)
+    curved = 1.055 * _floor(x, 0.0031308) ** (1 / 2.4) - 0.055  # floored: x^(1/2.4) has no slope at 0
+    return jnp.where(x <= 0.0031308, 12.92 * x, curved)
+
+
+@jax.jit
+def linear_from_srgb(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The inverse of `srgb_from_linear`."""
+    x = _floor(srgb)
+    curved = ((_floor(x, 0.04045) + 0.055) / 1.055) ** 2.4
+    return jnp.where(x <= 0.04045, x / 12.92, curved)
+
+
+@jax.jit
+def to_display(
+    color_linear: Float[Array, "*n"], exposure: float | Float[Array, ""] = 1.0
+) -> Float[Array, "*n"]:
+    """DISPLAY colour in [0, 1]: `sRGB(clip(ACES(exposure * color_linear)))`."""
+    return srgb_from_linear(tone_map(color_linear * exposure, "aces"))
+
+
+@jax.jit
+def from_display(display: Float[Array, "*n"], exposure: float | Float[Array, ""] = 1.0) -> Float[Array, "*n"]:
+    """Scene-linear colour of DISPLAY colour: exact below saturation, at most `7.24 / exposure`."""
+    return inverse_tone_map(linear_from_srgb(display), "aces") / exposure
+
+
+@jax.jit
+def ycocg_from_rgb(rgb: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """Luma Y and the chroma differences Co (orange), Cg (green): linear, invertible, any range.
+
+    `Y = (R + 2 G + B) / 4, Co = (R - B) / 2, Cg = (2 G - R - B) / 4`.
+    """
+    r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
+    return jnp.stack([0.25 * (r + b) + 0.5 * g, 0.5 * (r - b), 0.5 * g - 0.25 * (r + b)], axis=-1)
+
+
+@jax.jit
+def rgb_from_ycocg(ycocg: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
+    """The inverse of `ycocg_from_rgb`."""
+    y, co, cg = ycocg[..., 0], ycocg[..., 1], ycocg[..., 2]
+    return jnp.stack([y - cg + co, y + cg, y - cg - co], axis=-1)
+
+
+@jax.jit
+def luminance(linear: Float[Array, "*n 3"]) -> Float[Array, "*n 1"]:
+    """Relative luminance of linear sRGB (Rec. 709): `0.2126 R + 0.7152 G + 0.0722 B`."""
+    return 0.2126 * linear[..., 0:1] + 0.7152 * linear[..., 1:2] + 0.0722 * linear[..., 2:3]
