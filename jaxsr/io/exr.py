@@ -47,7 +47,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
     except OSError as e:
         raise JaxsrError("cannot write", where=path, found=e.strerror or e, fix="check the folder") from e
     finally:
-        temporary.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
 
 
 def remove_leftovers(folder: Path) -> int:

@@ -134,9 +134,7 @@ class SequenceWriter:
         self.precision, self.round_bits = PRECISION | dict(precision or {}), dict(round_bits or {})
         for layer, kind in [*self.precision.items(), *self.round_bits.items()]:
             if layer not in LAYERS or kind not in ("half", "float", "uint", *range(1, 24)):
-                raise JaxsrError(
-                    f"bad precision of layer {layer!r}", expected="half, float, uint", found=kind
-                )
+                raise JaxsrError(f"bad precision of {layer!r}", expected="half, float or uint", found=kind)
         for s in self.scales:
             if s < 1 or self.size[0] % s or self.size[1] % s:
                 raise JaxsrError(
@@ -171,14 +169,14 @@ class SequenceWriter:
     def write_frame(
         self,
         info: FrameInfo,
-        hr: Mapping[str, np.ndarray],
-        lr: Mapping[int, Mapping[str, np.ndarray]],
+        hr: Mapping[str, np.ndarray | None],
+        lr: Mapping[int, Mapping[str, np.ndarray | None]],
     ) -> None:
         """Write one frame, replacing it if it is there.
 
         Args:
             info: index, jitter, cut and camera.
-            hr: layer -> `[H, W, C]` (or `[H, W]`), unjittered.
+            hr: layer -> `[H, W, C]` (or `[H, W]`), unjittered; None is left out.
             lr: scale -> layer -> `[h, w, C]`, jittered; one for each scale above 1.
 
         Raises:
@@ -189,7 +187,8 @@ class SequenceWriter:
             raise JaxsrError("wrong LR scales", where=where, expected=list(self.scales), found=sorted(lr))
         for resolution, layers, scale in [("hr", hr, 1), *((f"x{s}", lr[s], s) for s in lr)]:
             shape = (self.size[1] // scale, self.size[0] // scale)
-            channels = self._channels(layers, shape, f"{where}, {resolution}")
+            needed = ("depth", "motion") if resolution == "hr" else ("color", "depth", "motion")
+            channels = self._channels(layers, needed, shape, f"{where}, {resolution}")
             write_exr(frame_file(self.path, resolution, info.index), channels)
         self._frames[int(info.index)] = info.to_json()
         self._write_json()
@@ -232,9 +231,12 @@ class SequenceWriter:
             temporary.write_text(f'{head},\n "frames": [\n  {rows}\n ]\n}}\n', encoding="utf-8")
 
     def _channels(
-        self, layers: Mapping[str, np.ndarray], shape: tuple[int, int], where: str
+        self,
+        layers: Mapping[str, np.ndarray | None],
+        needed: tuple[str, ...],
+        shape: tuple[int, int],
+        where: str,
     ) -> dict[str, np.ndarray]:
-        needed = ("depth", "motion") if "hr" in where.split(", ") else ("color", "depth", "motion")
         for layer in needed:
             if layers.get(layer) is None:
                 raise JaxsrError(f"missing layer {layer!r}", where=where, found=sorted(layers))

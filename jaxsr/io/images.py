@@ -1,0 +1,102 @@
+"""Single pictures: 8-bit PNG in and out, and any picture as linear colour.
+
+Display-referred images are float in [0, 1] (sRGB encoded), linear ones are scene-linear and unbounded. No
+tone mapping happens here: apply `jaxsr.ops.tone` before writing a PNG.
+"""
+
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
+from PIL import Image, UnidentifiedImageError
+
+from jaxsr.errors import JaxsrError
+from jaxsr.io.exr import atomic_path, read_exr
+
+
+def write_png(
+    path: str | Path, image: Float[np.ndarray, "h w c"] | UInt8[np.ndarray, "h w c"] | np.ndarray
+) -> None:
+    """Write an 8-bit PNG, atomically.
+
+    Args:
+        path: the file; its folder is made.
+        image: `[h, w]` or `[h, w, 1 | 3 | 4]`; floats are display-referred, clipped to [0, 1] and rounded
+            to the nearest of 256 levels; uint8 is written as it is.
+
+    Raises:
+        JaxsrError: wrong shape or type; NaN.
+    """
+    path, image = Path(path), np.asarray(image)
+    if image.ndim == 3 and image.shape[-1] == 1:
+        image = image[..., 0]
+    if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[-1] not in (3, 4)) or 0 in image.shape:
+        raise JaxsrError("not a picture", where=path, expected="[h, w, 1 | 3 | 4]", found=image.shape)
+    if np.issubdtype(image.dtype, np.floating):
+        if np.isnan(image).any():
+            raise JaxsrError(
+                "the picture holds NaN", where=path, found=f"{int(np.isnan(image).sum())} values"
+            )
+        image = np.rint(image.clip(0, 1).astype(np.float32) * 255).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise JaxsrError("wrong type of picture", where=path, expected="float or uint8", found=image.dtype)
+    with atomic_path(path) as temporary:
+        Image.fromarray(image).save(temporary, format="PNG")
+
+
+def read_png(path: str | Path) -> Float[np.ndarray, "h w 3"]:
+    """Read a PNG (or JPEG) as display-referred float32 RGB in [0, 1]; grey is repeated, alpha is dropped.
+
+    Raises:
+        JaxsrError: missing, or not a picture that can be decoded.
+    """
+    path = Path(path)
+    try:
+        with Image.open(path) as image:
+            deep = image.mode.startswith("I")  # 16-bit grey: convert("RGB") would clip it
+            pixels = np.asarray(image if deep else image.convert("RGB"), np.float32)
+    except FileNotFoundError as e:
+        raise JaxsrError("no such file", where=path) from e
+    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as e:
+        raise JaxsrError("cannot be read as a picture", where=path, found=e, fix="write it again") from e
+    if deep:
+        return np.repeat(pixels[..., None] / np.float32(65535), 3, -1)
+    return pixels / np.float32(255)
+
+
+def read_color(path: str | Path) -> Float[np.ndarray, "h w 3"]:
+    """Read a picture as scene-linear float32 RGB: OpenEXR as it is, PNG and JPEG through the sRGB curve.
+
+    Of an OpenEXR file the layer `color` is taken, or `R, G, B`, or Blender's `*.Combined`, or the only layer
+    with R, G and B.
+
+    Raises:
+        JaxsrError: unknown extension, unreadable file, no colour layer or several that could be meant.
+    """
+    path = Path(path)
+    kind = path.suffix.lower()
+    if kind in (".png", ".jpg", ".jpeg"):
+        return srgb_to_linear(read_png(path))
+    if kind != ".exr":
+        raise JaxsrError("unknown kind of picture", where=path, expected=".exr, .png or .jpg", found=kind)
+    channels, _ = read_exr(path)
+    prefixes = [n[:-1] for n in channels if n.endswith("R") and n[-2:-1] in ("", ".")]
+    whole = [p for p in prefixes if f"{p}G" in channels and f"{p}B" in channels]
+    named = [p for p in whole if p in ("color.", "") or p.endswith("Combined.")]
+    chosen = "color." if "color." in whole else (named or whole)
+    if not isinstance(chosen, str):
+        if len(chosen) != 1:
+            raise JaxsrError(
+                "no colour layer" if not chosen else "several layers could be the colour",
+                where=path,
+                expected="color.R, color.G, color.B or R, G, B",
+                found=", ".join(sorted(channels)),
+            )
+        chosen = chosen[0]
+    return np.stack([channels[f"{chosen}{c}"].astype(np.float32) for c in "RGB"], -1)
+
+
+def srgb_to_linear(display: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
+    """Inverse of the sRGB transfer function (IEC 61966-2-1), float32 in [0, 1]."""
+    x = np.asarray(display, np.float32)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)

@@ -1,0 +1,72 @@
+"""Tiny sequences for tests, from the analytic scene; every layer can be spoilt on the way to the disk."""
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsr.data import analytic
+from jaxsr.io.sequence import Sequence
+from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter
+
+Layers = dict[str, np.ndarray]
+
+
+def halton_jitter(index: int) -> tuple[float, float]:
+    """Halton(2, 3), length 32, minus 0.5, in float64."""
+
+    def radical_inverse(n: int, base: int) -> float:
+        value, factor = 0.0, 1.0 / base
+        while n:
+            value, n, factor = value + (n % base) * factor, n // base, factor / base
+        return value
+
+    return tuple(radical_inverse(index % 32 + 1, base) - 0.5 for base in (2, 3))
+
+
+def frame_info(index: int, size: tuple[int, int], *, cut: bool = False, **camera: Any) -> FrameInfo:
+    view = analytic.camera(index, size, **camera)
+    return FrameInfo(index, halton_jitter(index), cut, view.world_from_view, view.tan_half_fov)
+
+
+def make_sequence(
+    path: Path,
+    *,
+    frames: int = 3,
+    size: tuple[int, int] = (64, 40),
+    scales: tuple[int, ...] = (2,),
+    spoil: Callable[[str, Layers], None] | None = None,
+    jitter: Callable[[tuple[float, float]], tuple[float, float]] = lambda j: j,
+    still: bool = False,
+    frozen: bool = False,
+    **writer: Any,
+) -> Sequence:
+    """Write a sequence of the analytic scene and open it.
+
+    Args:
+        spoil: called with "hr", "x2", ... and the layers of that image, which it may change.
+        jitter: what the metadata says of a jitter that was rendered.
+        still, frozen: the camera, the objects do not move.
+        **writer: more arguments of `SequenceWriter`.
+    """
+    head: dict[str, Any] = {"name": path.name, "size": size, "scales": scales, "license": "CC0-1.0"} | writer
+    with SequenceWriter(path, **head) as out:
+        for index in range(1, frames + 1):
+            info = frame_info(index, size, cut=index == 1, still=still)
+            images = {"hr": analytic.render(index, size, still=still, frozen=frozen)}
+            for s in scales:
+                small = (size[0] // s, size[1] // s)
+                images[f"x{s}"] = analytic.render(
+                    index, small, jitter_px=info.jitter_px, still=still, frozen=frozen
+                )
+            for name, layers in images.items():
+                for extra in set(layers) - set(LAYERS):
+                    del layers[extra]
+                if spoil is not None:
+                    spoil(name, layers)
+            stated = FrameInfo(
+                index, jitter(info.jitter_px), info.cut, info.world_from_view, info.tan_half_fov
+            )
+            out.write_frame(stated, images["hr"], {s: images[f"x{s}"] for s in scales})
+    return Sequence.open(path)

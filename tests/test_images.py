@@ -1,0 +1,93 @@
+"""jaxsr.io.images: PNG round trips, the sRGB curve, and which layer of an OpenEXR file is the colour."""
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from jaxsr.errors import JaxsrError
+from jaxsr.io.exr import write_exr
+from jaxsr.io.images import read_color, read_png, srgb_to_linear, write_png
+
+
+def test_png_round_trip(tmp_path):
+    levels = (np.arange(256) / 255).astype(np.float32).reshape(16, 16, 1)
+    image = np.concatenate([levels, levels[::-1], levels[:, ::-1]], -1)
+    write_png(tmp_path / "sub" / "a.png", image)
+    np.testing.assert_array_equal(read_png(tmp_path / "sub" / "a.png"), image)
+    write_png(tmp_path / "b.png", (image * 255).round().astype(np.uint8))
+    np.testing.assert_array_equal(read_png(tmp_path / "b.png"), image)
+
+
+def test_png_clips_rounds_and_repeats_grey(tmp_path):
+    write_png(tmp_path / "a.png", np.array([[-1.0, 0.4999 / 255, 0.5001 / 255, 7.0, np.inf]]))
+    expected = np.repeat(np.array([0, 0, 1, 255, 255], np.float32)[None, :, None] / 255, 3, -1)
+    np.testing.assert_array_equal(read_png(tmp_path / "a.png"), expected)
+    write_png(tmp_path / "b.png", np.full((2, 2, 4), 0.5, np.float32))
+    assert read_png(tmp_path / "b.png").shape == (2, 2, 3)
+
+
+def test_16_bit_grey_is_not_clipped(tmp_path):
+    Image.fromarray(np.array([[0, 32768, 65535]], np.uint16)).save(tmp_path / "a.png")
+    np.testing.assert_allclose(read_png(tmp_path / "a.png")[0, :, 0], [0, 32768 / 65535, 1], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("image", "message"),
+    [
+        (np.full((2, 2, 3), np.nan), "holds NaN"),
+        (np.zeros((2, 2, 2)), "not a picture"),
+        (np.zeros((0, 2, 3)), "not a picture"),
+        (np.zeros((2, 2, 3), np.int64), "wrong type"),
+    ],
+)
+def test_png_refuses(tmp_path, image, message):
+    with pytest.raises(JaxsrError, match=message):
+        write_png(tmp_path / "a.png", image)
+    assert not list(tmp_path.iterdir())
+
+
+def test_srgb_curve():
+    # IEC 61966-2-1: the two branches meet at 0.04045; 0.5 decodes to 0.21404.
+    x = np.array([0.0, 0.04045, 0.5, 1.0], np.float32)
+    np.testing.assert_allclose(srgb_to_linear(x), [0, 0.0031308, 0.2140411, 1], atol=1e-6)
+
+
+def test_read_color(tmp_path):
+    rgb = np.random.default_rng(0).random((4, 5, 3)).astype(np.float32) * 3
+    for number, prefix in enumerate(["", "color.", "ViewLayer.Combined.", "beauty."]):
+        channels = {f"{prefix}{c}": rgb[..., k] for k, c in enumerate("RGB")}
+        write_exr(tmp_path / f"{number}.exr", channels | {"depth.Z": rgb[..., 0]})
+        np.testing.assert_array_equal(read_color(tmp_path / f"{number}.exr"), rgb)
+    write_png(tmp_path / "a.png", rgb)
+    np.testing.assert_array_equal(
+        read_color(tmp_path / "a.png"), srgb_to_linear(read_png(tmp_path / "a.png"))
+    )
+
+
+def test_color_is_chosen_before_other_layers(tmp_path):
+    ones = np.ones((2, 2), np.float32)
+    channels = {f"base_color.{c}": 0 * ones for c in "RGB"} | {f"color.{c}": ones for c in "RGB"}
+    write_exr(tmp_path / "a.exr", channels)
+    assert read_color(tmp_path / "a.exr").min() == 1
+
+
+def test_read_color_errors(tmp_path):
+    z = np.zeros((2, 2), np.float32)
+    write_exr(tmp_path / "none.exr", {"depth.Z": z})
+    with pytest.raises(JaxsrError, match=r"no colour layer.*found depth\.Z"):
+        read_color(tmp_path / "none.exr")
+    write_exr(tmp_path / "two.exr", {f"{layer}.{c}": z for layer in "ab" for c in "RGB"})
+    with pytest.raises(JaxsrError, match="several layers"):
+        read_color(tmp_path / "two.exr")
+    (tmp_path / "a.txt").write_text("x")
+    with pytest.raises(JaxsrError, match=r"unknown kind.*found \.txt"):
+        read_color(tmp_path / "a.txt")
+    (tmp_path / "a.png").write_text("x")
+    with pytest.raises(JaxsrError, match=r"a\.png: cannot be read"):
+        read_color(tmp_path / "a.png")
+    with pytest.raises(JaxsrError, match="no such file"):
+        read_color(tmp_path / "gone.png")
+    write_png(tmp_path / "whole.png", np.random.default_rng(0).random((64, 64, 3)))
+    (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:3000])
+    with pytest.raises(JaxsrError, match=r"cut\.png: cannot be read"):
+        read_color(tmp_path / "cut.png")
