@@ -1,1 +1,92 @@
-"""Pure functions on arrays: no files, no networks, no state."""
+"""Pure functions on arrays: no files, no networks, no state.
+
+Each takes one image `[H, W, C]` or a batch `[B, H, W, C]`, is jitted, and is differentiable unless it says
+otherwise. `jaxsr.frames` states the conventions.
+"""
+
+from jaxsr.ops.color import (
+    from_display,
+    inverse_tone_map,
+    linear_from_srgb,
+    luminance,
+    rgb_from_ycocg,
+    srgb_from_linear,
+    to_display,
+    tone_map,
+    ycocg_from_rgb,
+)
+from jaxsr.ops.demodulation import demodulate, demodulation_divisor, modulate
+from jaxsr.ops.geometry import camera_motion, project, view_directions, world_position
+from jaxsr.ops.jitter import (
+    SamplePositions,
+    current_positions,
+    halton,
+    jitter_sequence,
+    jittered_motion,
+    positions_from_jittered_motion,
+    positions_from_motion,
+    unjittered_motion,
+)
+from jaxsr.ops.masks import (
+    blend_mask,
+    depth_mask,
+    disocclusion_mask,
+    normal_mask,
+    position_mask,
+    stencil_mask,
+)
+from jaxsr.ops.resampling import (
+    depth_to_space,
+    pixel_grid,
+    resize,
+    sample,
+    sample_jittered,
+    space_to_depth,
+    upsample,
+    zero_upsample,
+)
+from jaxsr.ops.warping import backward_warp, forward_splat, occlusion_motion
+
+__all__ = [
+    "SamplePositions",
+    "backward_warp",
+    "blend_mask",
+    "camera_motion",
+    "current_positions",
+    "demodulate",
+    "demodulation_divisor",
+    "depth_mask",
+    "depth_to_space",
+    "disocclusion_mask",
+    "forward_splat",
+    "from_display",
+    "halton",
+    "inverse_tone_map",
+    "jitter_sequence",
+    "jittered_motion",
+    "linear_from_srgb",
+    "luminance",
+    "modulate",
+    "normal_mask",
+    "occlusion_motion",
+    "pixel_grid",
+    "position_mask",
+    "positions_from_jittered_motion",
+    "positions_from_motion",
+    "project",
+    "resize",
+    "rgb_from_ycocg",
+    "sample",
+    "sample_jittered",
+    "space_to_depth",
+    "srgb_from_linear",
+    "stencil_mask",
+    "to_display",
+    "tone_map",
+    "unjittered_motion",
+    "upsample",
+    "view_directions",
+    "world_position",
+    "ycocg_from_rgb",
+    "zero_upsample",
+]

@@ -21,7 +21,8 @@ from jaxsr.frames import Camera, GBuffer
 from jaxsr.ops._batch import over_batch
 from jaxsr.ops.geometry import camera_motion, view_directions, world_position
 from jaxsr.ops.jitter import jittered_motion
-from jaxsr.ops.resampling import gather_pixels, pixel_grid, sample, upsample
+from jaxsr.ops.resampling import gather_pixels, pixel_grid, upsample
+from jaxsr.ops.warping import backward_warp
 
 _MIN_WEIGHT = 0.01
 
@@ -253,11 +254,11 @@ def disocclusion_mask(
     same_normal = jnp.ones_like(same_place)
     if gbuffer.normal is not None and previous.normal is not None:
         same_normal = normal_mask(
-            gbuffer.normal, sample(previous.normal, positions, mode="nearest"), threshold
+            gbuffer.normal, backward_warp(previous.normal, motion, mode="nearest"), threshold
         )
     mask = jnp.where(moving, same_normal, same_place) * _as_mask(_in_frame(positions, height, width))
     if gbuffer.object_id is not None and previous.object_id is not None:
-        mask *= stencil_mask(gbuffer.object_id, sample(previous.object_id, positions, mode="nearest"))
+        mask *= stencil_mask(gbuffer.object_id, backward_warp(previous.object_id, motion, mode="nearest"))
     return mask
 
 
