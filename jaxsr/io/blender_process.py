@@ -1,4 +1,4 @@
-"""Finding Blender, and running `blender_script.py` in it as a child process that never outlives its parent."""
+"""Finding Blender, and running `blender_script.py` in it as a child process that ends with its parent."""
 
 import importlib.util
 import json
