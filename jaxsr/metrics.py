@@ -224,17 +224,22 @@ def temporal_psnr(
 
 
 def measure(
-    images: Sequence[Image], truths: Sequence[Image], starts: Sequence[bool] | None = None
+    images: Sequence[Image],
+    truths: Sequence[Image],
+    starts: Sequence[bool] | None = None,
+    flip_maps: Sequence[Float[np.ndarray, "h w"]] | None = None,
 ) -> dict[str, list[float | None]]:
     """Every metric of `METRICS`, by its key, for every frame.
 
-    Images smaller than the SSIM window have None for SSIM.
+    Images smaller than the SSIM window have None for SSIM. `starts` is that of `temporal_psnr`; `flip_maps`
+    are those of `flip_map` at its default distance, if they were made already.
     """
-    tpsnr = temporal_psnr(images, truths, starts=starts)
+    tpsnr = temporal_psnr(images, truths, starts=starts)  # checks the lengths
     pairs = list(zip(images, truths, strict=True))
+    maps = [flip_map(a, b) for a, b in pairs] if flip_maps is None else flip_maps
     return {
         "psnr": [psnr(a, b) for a, b in pairs],
         "ssim": [ssim(a, b) if min(b.shape[:2]) >= SSIM_WINDOW else None for a, b in pairs],
-        "flip": [flip(a, b) for a, b in pairs],
+        "flip": [float(m.mean(dtype=np.float64)) for m in maps],
         "tpsnr": tpsnr,
     }
