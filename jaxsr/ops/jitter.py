@@ -60,7 +60,7 @@ def halton(index: int | Int[np.ndarray, "*n"], base: int) -> Float[np.ndarray, "
         place /= base
         value = value + place * (remaining % base)
         remaining = remaining // base
-    return value
+    return np.asarray(value)
 
 
 def jitter_sequence(count: int, length: int = 32) -> Float[np.ndarray, "count 2"]:

@@ -10,6 +10,7 @@ NaN pixel reaches only the results that give it a weight: depth +inf for sky doe
 """
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -118,8 +119,10 @@ def sample(
             for x, weight_x in columns:
                 tap = gather_pixels(image, x, y)
                 weight = (weight_y * weight_x)[..., None].astype(image.dtype)
-                # 0 * inf is NaN. The tap, not the product, is replaced: its weight keeps its gradient.
-                tap = jnp.where((weight == 0) & ~jnp.isfinite(tap), 0, tap)
+                # 0 * inf is NaN, in the value and, times a zero cotangent, in the gradient of the weight.
+                finite = jnp.isfinite(tap)
+                tap = jnp.where(finite | (weight != 0), tap, 0)
+                weight = jnp.where(finite, weight, jax.lax.stop_gradient(weight))
                 total = weight * tap if total is None else total + weight * tap
         assert total is not None
         return total
@@ -168,7 +171,7 @@ def resize(
     return _resize_axis(_resize_axis(image, size[0], -3, mode), size[1], -2, mode)
 
 
-def _slice(image: Array, axis: int, start: int | None, stop: int | None) -> Array:
+def _slice(image: Array, axis: int, start: Any, stop: Any) -> Array:
     return image[(..., slice(start, stop), *[slice(None)] * (-axis - 1))]
 
 
