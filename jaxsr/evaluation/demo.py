@@ -1,0 +1,115 @@
+"""`jaxsr demo`: the sample that ships with the package, upscaled and extrapolated, measured and shown."""
+
+import importlib.resources
+import json
+import platform
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+import jaxsr
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.report import write_report
+from jaxsr.evaluation.tables import Section, as_json, markdown
+from jaxsr.evaluation.upscale import run_section
+from jaxsr.evaluation.video import write_video
+from jaxsr.io.exr import atomic_path
+from jaxsr.io.sequence import Sequence as FrameSequence
+
+UPSCALERS = ("nearest", "bilinear", "bicubic", "taau")
+EXTRAPOLATORS = ("nearest", "bilinear", "taau", "guided")
+
+
+def sample_folder() -> Path:
+    """The folder of the sample sequences inside the package."""
+    return Path(str(importlib.resources.files(jaxsr) / "sample"))
+
+
+def sample_sequences() -> list[Path]:
+    """The test sequences of the sample, one a scene.
+
+    Raises:
+        JaxsrError: the package was installed without them.
+    """
+    found = sorted(path.parent for path in sample_folder().glob("*-test-*/sequence.json"))
+    if not found:
+        raise JaxsrError("the sample is missing", where=sample_folder(), fix="reinstall jaxsr")
+    return found
+
+
+def description(**settings: Any) -> dict[str, Any]:
+    """What a result must carry: versions, device, date and settings."""
+    return {
+        "jaxsr": jaxsr.__version__,
+        "jax": jax.__version__,
+        "device": f"{jax.devices()[0].device_kind}, {platform.machine()}",
+        "python": platform.python_version(),
+        "date": time.strftime("%Y-%m-%d"),
+        "display": "sRGB of the ACES tone map (Narkowicz fit) of exposure times linear colour; no crop",
+        **settings,
+    }
+
+
+def run_demo(
+    out: Path,
+    sequences: Sequence[Path],
+    *,
+    scale: int,
+    progress: Callable[[str, int], Callable[[], Any]],
+) -> list[Section]:
+    """Run the demo and write frames, videos, metrics and the page into `out`.
+
+    Args:
+        progress: called with a title and a number of steps; returns what is called after each step.
+
+    Raises:
+        JaxsrError: a sequence cannot be read or lacks the scale.
+    """
+    opened = [FrameSequence.open(path) for path in sequences]
+    tasks = (("super-resolution", 1, UPSCALERS), ("extrapolation", 2, EXTRAPOLATORS))
+    total = sum(len(s) * len(methods) for s in opened for _, _, methods in tasks)
+    advance = progress("frames", total)
+    sections = []
+    for sequence in opened:
+        for task, every, methods in tasks:
+            folder = out / sequence.name / task
+            sections.append(run_section(sequence, methods, folder, scale=scale, every=every, advance=advance))
+    write_results(out, sections, title="jaxsr demo", meta=description(scale=scale))
+    advance = progress("videos", len(sections))
+    fps = opened[0].fps / 3  # slow motion: the sample is short
+    for section, (sequence, (task, _, _)) in zip(
+        sections, [(s, t) for s in opened for t in tasks], strict=True
+    ):
+        shown = {"input": _enlarged(section), **{t.name: t.images for t in section.tracks[-2:]}}
+        shown["truth"] = section.truths
+        columns = {label: [np.asarray(image) for image in images] for label, images in shown.items()}
+        write_video(out / f"{sequence.name}-{task}.mp4", columns, fps=fps)
+        advance()
+    return sections
+
+
+def write_results(out: Path, sections: Sequence[Section], *, title: str, meta: dict[str, Any]) -> None:
+    """Write `report.html`, `metrics.json` and `metrics.md`."""
+    write_report(out / "report.html", sections, title=title, meta=meta)
+    with atomic_path(out / "metrics.json") as temporary:
+        temporary.write_text(json.dumps(as_json(sections, title=title, meta=meta), indent=1) + "\n")
+    with atomic_path(out / "metrics.md") as temporary:
+        temporary.write_text(markdown(sections) + "\n")
+
+
+def _enlarged(section: Section) -> list[np.ndarray]:
+    """The inputs at the size of the truth by pixel repetition; the last one stays where none was rendered."""
+    height = np.asarray(section.truths[0]).shape[0]
+    images: list[np.ndarray] = []
+    for given in section.inputs:
+        if given is None:
+            images.append(images[-1])
+            continue
+        pixels = np.asarray(given)
+        factor = height // pixels.shape[0]
+        images.append(pixels.repeat(factor, 0).repeat(factor, 1))
+    return images

@@ -1,0 +1,125 @@
+"""Methods over a sequence on disk: frames out as EXR and PNG, and a `Section` of results.
+
+The truth is read only after a method has made its frame, and only to measure it.
+"""
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.run import check_needs, find_method, observed, rendered_schedule, stream
+from jaxsr.evaluation.tables import Section, Timing, Track
+from jaxsr.io.exr import write_exr
+from jaxsr.io.images import write_png
+from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.methods import Method
+from jaxsr.metrics import measure
+from jaxsr.ops import to_display
+
+Advance = Callable[[], Any]
+"""Called once for every frame that is done."""
+
+
+def display(color_linear: np.ndarray, exposure: float) -> np.ndarray:
+    """The display-referred image of jaxsr: sRGB of the ACES tone map, float32 in [0, 1]."""
+    return np.asarray(to_display(np.ascontiguousarray(color_linear), exposure))
+
+
+def upscale(
+    sequence: FrameSequence,
+    method: Method,
+    out: Path,
+    *,
+    scale: int,
+    every: int = 1,
+    advance: Advance | None = None,
+) -> tuple[list[np.ndarray], Timing]:
+    """Run one method over a sequence and write `out/exr/0001.exr` (linear half) and `out/png/0001.png`.
+
+    Args:
+        scale: of the LR frames to start from; 1 takes the HR frames, to make only those between them.
+        every: every n-th frame counts as rendered, the others are extrapolated from their G-buffer.
+        advance: progress callback.
+
+    Returns:
+        The display-referred images, and the time of a frame.
+
+    Raises:
+        JaxsrError: what the method needs is not there, or a frame cannot be read.
+    """
+    check_needs(method, sequence, scale)
+    images, seconds, compile_seconds = [], [], 0.0
+    for info, made in zip(sequence.infos, stream(method, observed(sequence, scale, every)), strict=True):
+        half = np.clip(made.image, 0, np.finfo(np.float16).max).astype(np.float16)
+        channels = {f"color.{c}": half[..., k] for k, c in enumerate("RGB")}
+        write_exr(out / "exr" / f"{info.index:04d}.exr", channels)
+        image = display(made.image, sequence.exposure)
+        write_png(out / "png" / f"{info.index:04d}.png", image)
+        images.append(image)
+        seconds.append(made.seconds)
+        compile_seconds += made.compile_seconds
+        if advance is not None:
+            advance()
+    low, middle, high = np.percentile(seconds, [25, 50, 75]) * 1e3
+    return images, Timing(compile_seconds, float(middle), float(high - low))
+
+
+def run_section(
+    sequence: FrameSequence,
+    methods: Sequence[str],
+    out: Path,
+    *,
+    scale: int,
+    every: int = 1,
+    advance: Advance | None = None,
+) -> Section:
+    """Several methods over one sequence, each measured against the truth.
+
+    Writes `out/<method>/exr|png/` and `out/truth/png/`.
+
+    Raises:
+        JaxsrError: an unknown method, a missing buffer, or a sequence without truth.
+    """
+    found = [find_method(name) for name in methods]
+    truths = [display(sequence.truth(i), sequence.exposure) for i in range(len(sequence))]
+    for info, truth in zip(sequence.infos, truths, strict=True):
+        write_png(out / "truth" / "png" / f"{info.index:04d}.png", truth)
+    schedule = rendered_schedule(sequence, every)
+    inputs = [
+        display(sequence.frame(i, scale).color_linear, sequence.exposure) if rendered else None
+        for i, rendered in enumerate(schedule)
+    ]
+    starts = [info.cut for info in sequence.infos]
+    tracks = []
+    for method in found:
+        images, timing = upscale(
+            sequence, method, out / method.name, scale=scale, every=every, advance=advance
+        )
+        if images[0].shape != truths[0].shape:
+            raise JaxsrError(
+                "output and truth differ in size",
+                where=sequence.path,
+                expected=truths[0].shape,
+                found=images[0].shape,
+            )
+        tracks.append(Track(method.name, images, measure(images, truths, starts), timing, method.summary))
+    task = f"x{scale}" if scale > 1 else "full size"
+    if every == 2:
+        task += ", every second frame extrapolated"
+    elif every > 2:
+        task += f", {every - 1} of {every} frames extrapolated"
+    elif scale > 1:
+        task += ", super-resolution"
+    return Section(
+        title=f"{sequence.name}, {task}",
+        frames=[info.index for info in sequence.infos],
+        truths=truths,
+        tracks=tracks,
+        inputs=inputs,
+        extrapolated=[not rendered for rendered in schedule] if every > 1 else (),
+        exposure=sequence.exposure,
+        meta={"scale": scale, "every": every, "sequence": sequence.name},
+    )

@@ -1,0 +1,44 @@
+"""What a method is: a pure step over a sequence, and what it needs to take that step."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+from jaxtyping import Array, Float
+
+from jaxsr.frames import Frame
+
+State = Any
+"""A pytree of arrays; constant in size whatever the length of the clip."""
+Net = Any
+"""A pytree of parameters; None for methods that learn nothing."""
+Step = Callable[[Net, State, Frame], tuple[State, Float[Array, "H W 3"]]]
+
+
+class Method(NamedTuple):
+    """A name, two pure functions and a list of needs.
+
+    `step(net, state, frame) -> state, image` makes the HR linear colour of one frame; it serves streaming,
+    `jax.lax.scan`, evaluation and export alike. It never sees the truth. Where `frame.cut` is set it ignores
+    the state; where `frame.rendered` is not, it extrapolates and ignores `frame.color_linear`.
+    """
+
+    name: str
+    summary: str
+    init: Callable[[Frame], State]
+    """The empty state for frames of this shape."""
+    step: Step
+    needs: frozenset[str]
+    """Buffers by size and name, for instance "lr.color" or "hr.normal"."""
+
+
+def by_rendered(
+    upscale: Callable[[Net, State, Frame], tuple[State, Array]],
+    extrapolate: Callable[[Net, State, Frame], tuple[State, Array]],
+) -> Step:
+    """A step that upscales rendered frames and extrapolates the others."""
+
+    def step(net: Net, state: State, frame: Frame) -> tuple[State, Array]:
+        return jax.lax.cond(frame.rendered, upscale, extrapolate, net, state, frame)
+
+    return step
