@@ -36,7 +36,7 @@ def make_sequence(
     frames: int = 3,
     size: tuple[int, int] = (64, 40),
     scales: tuple[int, ...] = (2,),
-    spoil: Callable[[str, Layers], None] | None = None,
+    spoil: Callable[[str, int, Layers], None] | None = None,
     jitter: Callable[[tuple[float, float]], tuple[float, float]] = lambda j: j,
     still: bool = False,
     frozen: bool = False,
@@ -45,7 +45,7 @@ def make_sequence(
     """Write a sequence of the analytic scene and open it.
 
     Args:
-        spoil: called with "hr", "x2", ... and the layers of that image, which it may change.
+        spoil: called with "hr", "x2", ..., the frame's number and the layers, which it may change.
         jitter: what the metadata says of a jitter that was rendered.
         still, frozen: the camera, the objects do not move.
         **writer: more arguments of `SequenceWriter`.
@@ -64,7 +64,7 @@ def make_sequence(
                 for extra in set(layers) - set(LAYERS):
                     del layers[extra]
                 if spoil is not None:
-                    spoil(name, layers)
+                    spoil(name, index, layers)
             stated = FrameInfo(
                 index, jitter(info.jitter_px), info.cut, info.world_from_view, info.tan_half_fov
             )

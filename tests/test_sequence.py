@@ -94,7 +94,7 @@ def test_positions_are_rebuilt_from_depth_camera_and_jitter(seq):
 
 
 def test_missing_layers_are_none_or_named(tmp_path):
-    def only_needed(name, layers):
+    def only_needed(name, index, layers):
         for layer in set(layers) - {"color", "depth", "motion"}:
             del layers[layer]
         if name == "hr":
