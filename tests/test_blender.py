@@ -18,10 +18,11 @@ import pytest
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera
-from jaxsr.io.blender import halton_jitter, render
+from jaxsr.io.blender import render
 from jaxsr.io.blender_convert import Instances, convert_color, convert_gbuffer, sky_motion
 from jaxsr.io.blender_process import find_blender, last_meaningful_line
 from jaxsr.io.sequence import Sequence
+from jaxsr.ops.jitter import jitter_sequence
 from tests import blender_scene
 
 SCENE = Path(__file__).with_name("blender_scene.py")
@@ -146,13 +147,6 @@ def test_sky_motion_behind_the_previous_camera_is_zero():
     assert not sky_motion(STILL, turned, (4, 3)).any()
 
 
-def test_jitter_is_halton():
-    jitter = halton_jitter()
-    assert len(set(jitter)) == 32
-    np.testing.assert_allclose(jitter[:4], [(0, -1 / 6), (-0.25, 1 / 6), (0.25, -7 / 18), (-0.375, -1 / 18)])
-    assert np.abs(np.asarray(jitter)).max() <= 0.5
-
-
 # --- finding Blender, arguments -------------------------------------------------------------------------
 
 
@@ -238,7 +232,7 @@ def test_description(rendered):
     assert [i.cut for i in rendered.infos] == [True, False, False, False]
     assert rendered.exposure == 0.5
     assert rendered.generator["samples"] == 1 or rendered.generator["seed"] == 0
-    for info, jitter in zip(rendered.infos, halton_jitter(), strict=False):
+    for info, jitter in zip(rendered.infos, jitter_sequence(32), strict=False):
         expected = camera_at(info.index)
         np.testing.assert_allclose(info.jitter_px, jitter, atol=1e-9)
         np.testing.assert_allclose(info.world_from_view, expected.world_from_view, atol=2e-6)

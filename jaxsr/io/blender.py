@@ -23,8 +23,10 @@ from jaxsr.io.blender_convert import Instances, camera_from_json, convert_color,
 from jaxsr.io.blender_process import BlenderProcess, find_blender
 from jaxsr.io.exr import read_exr
 from jaxsr.io.writing import FrameInfo, SequenceWriter
+from jaxsr.ops.jitter import jitter_sequence
 
 JITTER_LENGTH = 32
+"""Frame f has point `(f - 1) mod 32` of the Halton jitter, whatever range is rendered."""
 
 
 class Progress(NamedTuple):
@@ -33,19 +35,8 @@ class Progress(NamedTuple):
     done_frames: float
     total_frames: int
     message: str
-
-
-def halton_jitter(count: int = JITTER_LENGTH) -> list[tuple[float, float]]:
-    """Halton (2, 3) points 1 .. count, minus 0.5: the jitter of frames 1, 2, ... in LR pixels."""
-
-    def radical_inverse(i: int, base: int) -> float:
-        value, weight = 0.0, 1.0 / base
-        while i:
-            i, digit = divmod(i, base)
-            value, weight = value + digit * weight, weight / base
-        return value
-
-    return [(radical_inverse(i, 2) - 0.5, radical_inverse(i, 3) - 0.5) for i in range(1, count + 1)]
+    cpu_seconds: float
+    """CPU time that Blender has spent so far in this run, building the scene included."""
 
 
 def render(
@@ -116,7 +107,7 @@ def render(
         "samples": samples,
         "denoise": denoise,
         "exposure": exposure,
-        "jitter_px": halton_jitter(),
+        "jitter_px": jitter_sequence(JITTER_LENGTH, JITTER_LENGTH).tolist(),
         "seed": seed,
         "threads": threads,
         "attended": True,
@@ -250,4 +241,5 @@ class _Reporter:
         else:
             return
         if self.progress is not None:
-            self.progress(Progress(min(self.done + self.part, self.total), self.total, message))
+            done = min(self.done + self.part, self.total)
+            self.progress(Progress(done, self.total, message, event["cpu_seconds"]))

@@ -133,7 +133,7 @@ class BlenderProcess:
         """What the script found in the scene, with the job's gaps filled."""
         for event in self.events():
             if event["event"] == "scene":
-                return event
+                return {k: v for k, v in event.items() if k not in ("event", "cpu_seconds")}
         raise self._failure()
 
     def events(self) -> Iterator[dict[str, Any]]:
@@ -148,7 +148,7 @@ class BlenderProcess:
                 continue
             event = json.loads(line)
             if event["event"] == "error":
-                raise JaxsrError(event.pop("what"), **{k: v for k, v in event.items() if k != "event"})
+                raise JaxsrError(**{k: v for k, v in event.items() if k not in ("event", "cpu_seconds")})
             yield event
             if event["event"] == "done":
                 return

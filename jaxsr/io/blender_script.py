@@ -55,7 +55,8 @@ class Events:
         os.dup2(2, 1)
 
     def __call__(self, event: str, **fields: Any) -> None:
-        self._stream.write(json.dumps({"event": event, **fields}) + "\n")
+        spent = {"cpu_seconds": round(time.process_time(), 3)}
+        self._stream.write(json.dumps({"event": event, **fields, **spent}) + "\n")
         self._stream.flush()
 
 

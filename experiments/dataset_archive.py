@@ -1,0 +1,397 @@
+"""A rendered data set in one small file, and back: quantisation, lossless coding, checksums.
+
+The archive is a ZIP file (stored, readable by any tool) of `manifest.json` and one member a frame and
+resolution. `manifest.json` holds each sequence's `sequence.json` word for word, the quantisation, and the
+SHA-256 of every member; `ARCHIVE.sha256` beside the archive holds that of the whole.
+
+Quantisation (what `unpack` returns differs from what was packed by at most this):
+
+| layer | stored as | error |
+|---|---|---|
+| color | half float, mantissa rounded to `color_bits` | relative 2^-(color_bits + 1); negatives become 0 |
+| depth | 16-bit logarithm between the image's extremes, 65535 for sky | relative (log range) / 131068 |
+| motion | rest over the camera's motion at that depth, in steps of 1/64 pixel | 1/128 pixel |
+| normal | octahedral, 8 bits a coordinate | 0.9 degrees |
+| base_color | 8 bits, sRGB curve | half a step |
+| roughness, metallic | 8 bits, linear | 1/510 |
+| object_id | exact | 0 |
+
+World position is not stored: it is rebuilt from depth. The integer planes are coded without loss: green taken
+from red and blue, the best of four linear predictors, bytes of equal significance together, LZMA.
+"""
+
+import hashlib
+import io
+import json
+import lzma
+import struct
+import zipfile
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxsr.errors import JaxsrError
+from jaxsr.io.exr import atomic_path, read_exr
+from jaxsr.io.sequence import Sequence, world_position
+from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter, frame_file
+
+FORMAT, VERSION = "jaxsr-archive", 1
+MOTION_STEP = 64.0
+SKY_CODE = 65535
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0}]
+_EPOCH = (1980, 1, 1, 0, 0, 0)
+
+
+# --- quantisation ----------------------------------------------------------------------------------------
+
+
+def quantise_color(color: np.ndarray, bits: int) -> np.ndarray:
+    """Half floats as 16-bit integers of which the low `10 - bits` mantissa bits are rounded off."""
+    half = np.clip(color, 0, 65504 * (1 - 2.0**-9)).astype(np.float16).view(np.uint16).astype(np.uint32)
+    drop = 10 - bits
+    return ((half + ((1 << drop) >> 1)) >> drop).astype(np.uint16)
+
+
+def restore_color(code: np.ndarray, bits: int) -> np.ndarray:
+    return (code.astype(np.uint16) << (10 - bits)).view(np.float16).astype(np.float32)
+
+
+def quantise_depth(depth: np.ndarray) -> tuple[np.ndarray, list[float]]:
+    sky = ~np.isfinite(depth)
+    if sky.all():
+        return np.full(depth.shape, SKY_CODE, np.uint16), [0.0, 1.0]
+    logs = np.log2(np.maximum(np.where(sky, depth[~sky].min(), depth), 1e-6).astype(np.float64))
+    low, high = float(logs.min()), max(float(logs.max()), float(logs.min()) + 1e-6)
+    code = np.rint((logs - low) / (high - low) * (SKY_CODE - 1))
+    return np.where(sky, SKY_CODE, code).astype(np.uint16), [low, high]
+
+
+def restore_depth(code: np.ndarray, limits: list[float]) -> np.ndarray:
+    low, high = limits
+    depth = np.exp2(low + code.astype(np.float64) / (SKY_CODE - 1) * (high - low))
+    return np.where(code == SKY_CODE, np.inf, depth).astype(np.float32)
+
+
+def quantise_normal(normal: np.ndarray) -> np.ndarray:
+    """Octahedral map (Meyer et al. 2010, "On floating-point normal vectors"), 8 bits a coordinate."""
+    n = normal / np.maximum(np.abs(normal).sum(-1, keepdims=True), 1e-9)
+    folded = (1 - np.abs(n[..., 1::-1])) * np.where(n[..., :2] >= 0, 1, -1)
+    return np.rint((np.where(n[..., 2:] < 0, folded, n[..., :2]) * 0.5 + 0.5) * 254).astype(np.uint8)
+
+
+def restore_normal(code: np.ndarray, sky: np.ndarray) -> np.ndarray:
+    xy = code.astype(np.float32) / 127 - 1
+    z = 1 - np.abs(xy).sum(-1, keepdims=True)
+    folded = (1 - np.abs(xy[..., ::-1])) * np.where(xy >= 0, 1, -1)
+    n = np.concatenate([np.where(z < 0, folded, xy), z], -1)
+    n /= np.linalg.norm(n, axis=-1, keepdims=True)
+    return np.where(sky[..., None], 0, n).astype(np.float32)
+
+
+def camera_motion(
+    depth: np.ndarray, info: FrameInfo, before: FrameInfo, jitter: tuple[float, float]
+) -> np.ndarray:
+    """Motion of a world that stands still, from depth `[h, w]`; the sky lies far away."""
+    h, w = depth.shape
+    near = np.where(np.isfinite(depth), depth, 1e7)[..., None]
+    world = world_position(near, info, jitter).astype(np.float64)
+    matrix = np.asarray(before.world_from_view, float)
+    view = (world - matrix[:3, 3]) @ matrix[:3, :3]
+    z = np.maximum(view[..., 2:], 1e-3)
+    ndc = view[..., :2] / (z * np.asarray(before.tan_half_fov)) - np.asarray(before.lens_shift)
+    y, x = np.mgrid[0:h, 0:w]
+    p = np.stack([x + jitter[0], y + jitter[1]], -1)
+    return np.clip(p - ((ndc + 1) / 2 * (w, h) - 0.5), -4096, 4096)
+
+
+def _srgb(x: np.ndarray) -> np.ndarray:
+    x = np.clip(x, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def _linear(x: np.ndarray) -> np.ndarray:
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+# --- lossless coding of integer planes -------------------------------------------------------------------
+
+
+def _predict(plane: np.ndarray, kind: int) -> np.ndarray:
+    """Residuals modulo the integer range: 0 none, 1 left, 2 above, 3 left + above - above left."""
+    out = plane.copy()
+    if kind & 1:
+        out[:, 1:] -= out[:, :-1].copy()
+    if kind & 2:
+        out[1:] -= out[:-1].copy()
+    return out
+
+
+def _unpredict(residual: np.ndarray, kind: int) -> np.ndarray:
+    out = residual
+    if kind & 2:
+        out = np.cumsum(out, axis=0, dtype=out.dtype)
+    if kind & 1:
+        out = np.cumsum(out, axis=1, dtype=out.dtype)
+    return out
+
+
+def encode_plane(plane: np.ndarray) -> tuple[dict[str, Any], bytes]:
+    """One unsigned integer plane to bytes, and what is needed to undo it."""
+    signed = np.dtype(f"i{plane.dtype.itemsize}")
+
+    def zigzag(x: np.ndarray) -> np.ndarray:
+        s = x.view(signed)
+        return ((s << 1) ^ (s >> (8 * plane.dtype.itemsize - 1))).view(plane.dtype)
+
+    best = None
+    for kind in range(4):
+        folded = zigzag(_predict(plane, kind))
+        raw = b"".join((folded >> (8 * k)).astype(np.uint8).tobytes() for k in range(plane.dtype.itemsize))
+        packed = lzma.compress(raw, lzma.FORMAT_RAW, filters=_FILTERS)
+        if best is None or len(packed) < len(best[1]):
+            best = ({"kind": kind, "dtype": plane.dtype.str, "bytes": len(packed)}, packed)
+    assert best is not None
+    return best
+
+
+def decode_plane(note: Mapping[str, Any], packed: bytes, shape: tuple[int, int]) -> np.ndarray:
+    dtype = np.dtype(note["dtype"])
+    raw = np.frombuffer(lzma.decompress(packed, lzma.FORMAT_RAW, filters=_FILTERS), np.uint8)
+    parts = raw.reshape(dtype.itemsize, *shape).astype(dtype)
+    folded = sum((parts[k] << (8 * k) for k in range(1, dtype.itemsize)), parts[0]).astype(dtype)
+    residual = (folded >> 1) ^ (0 - (folded & 1)).astype(dtype)
+    return _unpredict(residual.astype(dtype), note["kind"])
+
+
+def _planes_of(code: np.ndarray) -> list[np.ndarray]:
+    """Channels as planes; of colours, red and blue are stored as differences from green."""
+    planes = [np.ascontiguousarray(code[..., k]) for k in range(code.shape[-1])]
+    return planes if len(planes) != 3 else [planes[0] - planes[1], planes[1], planes[2] - planes[1]]
+
+
+def _code_of(planes: list[np.ndarray]) -> np.ndarray:
+    if len(planes) == 3:
+        planes = [planes[0] + planes[1], planes[1], planes[2] + planes[1]]
+    return np.stack(planes, -1)
+
+
+def encode_frame(
+    layers: Mapping[str, np.ndarray],
+    info: FrameInfo,
+    before: FrameInfo,
+    jitter: tuple[float, float],
+    color_bits: int,
+) -> bytes:
+    """All layers of one image; `before` is the frame before (or `info` again where there is none)."""
+    depth, limits = quantise_depth(layers["depth"][..., 0])
+    codes: dict[str, np.ndarray] = {"depth": depth[..., None]}
+    still = camera_motion(restore_depth(depth, limits), info, before, jitter)
+    codes["motion"] = np.rint((layers["motion"] - still) * MOTION_STEP).astype(np.int32).view(np.uint32)
+    if "color" in layers:
+        codes["color"] = quantise_color(layers["color"], color_bits)
+    if "normal" in layers:
+        codes["normal"] = quantise_normal(layers["normal"])
+    if "base_color" in layers:
+        codes["base_color"] = np.rint(_srgb(layers["base_color"]) * 255).astype(np.uint8)
+    for name in ("roughness", "metallic"):
+        if name in layers:
+            codes[name] = np.rint(np.clip(layers[name], 0, 1) * 255).astype(np.uint8)
+    notes: dict[str, Any] = {"shape": depth.shape, "depth": limits, "color_bits": color_bits, "planes": {}}
+    if "object_id" in layers:
+        values, index = np.unique(layers["object_id"], return_inverse=True)
+        notes["ids"] = [int(v) for v in values]
+        codes["object_id"] = index.reshape(layers["object_id"].shape).astype(np.uint16)
+    body = io.BytesIO()
+    for name, code in codes.items():
+        notes["planes"][name] = []
+        for plane in _planes_of(code):
+            note, packed = encode_plane(plane)
+            notes["planes"][name].append(note)
+            body.write(packed)
+    head = json.dumps(notes, separators=(",", ":")).encode()
+    return struct.pack("<I", len(head)) + head + body.getvalue()
+
+
+def decode_frame(
+    blob: bytes, info: FrameInfo, before: FrameInfo, jitter: tuple[float, float]
+) -> dict[str, np.ndarray]:
+    """The inverse of `encode_frame`, float32 layers `[h, w, c]`."""
+    (length,) = struct.unpack_from("<I", blob)
+    notes, at = json.loads(blob[4 : 4 + length]), 4 + length
+    shape = (int(notes["shape"][0]), int(notes["shape"][1]))
+    codes = {}
+    for name, planes in notes["planes"].items():
+        decoded = []
+        for note in planes:
+            decoded.append(decode_plane(note, blob[at : at + note["bytes"]], shape))
+            at += note["bytes"]
+        codes[name] = _code_of(decoded)
+    depth = restore_depth(codes["depth"][..., 0], notes["depth"])
+    layers = {"depth": depth[..., None]}
+    rest = np.ascontiguousarray(codes["motion"]).view(np.int32) / MOTION_STEP
+    layers["motion"] = camera_motion(depth, info, before, jitter) + rest
+    if "color" in codes:
+        layers["color"] = restore_color(codes["color"], notes["color_bits"])
+    if "normal" in codes:
+        layers["normal"] = restore_normal(codes["normal"], ~np.isfinite(depth))
+    if "base_color" in codes:
+        layers["base_color"] = _linear(codes["base_color"] / 255)
+    for name in ("roughness", "metallic"):
+        if name in codes:
+            layers[name] = codes[name] / 255
+    if "object_id" in codes:
+        layers["object_id"] = np.asarray(notes["ids"], np.float64)[codes["object_id"]]
+    return {name: np.asarray(x, np.float32) for name, x in layers.items()}
+
+
+# --- the archive -----------------------------------------------------------------------------------------
+
+
+def _raw_layers(path: Path) -> dict[str, np.ndarray]:
+    channels, _ = read_exr(path, pad=False)
+    return {
+        layer: np.stack([channels[f"{layer}.{c}"].astype(np.float32) for c in letters], -1)
+        for layer, letters in LAYERS.items()
+        if layer != "position" and f"{layer}.{letters[0]}" in channels
+    }
+
+
+def _images(
+    infos: list[FrameInfo], resolutions: Iterable[str]
+) -> Iterable[tuple[FrameInfo, FrameInfo, str, Any]]:
+    """(frame, the one before, resolution, jitter) of every image, in the order of the archive."""
+    for k, info in enumerate(infos):
+        before = infos[k - 1] if k and not info.cut else info
+        for resolution in resolutions:
+            yield info, before, resolution, (0.0, 0.0) if resolution == "hr" else info.jitter_px
+
+
+def pack(
+    sequences: Mapping[str, Path],
+    archive: Path,
+    color_bits: int = 6,
+    max_megabytes: float = 200.0,
+    progress: Callable[[str, int], None] = lambda name, size: None,
+) -> str:
+    """Write the archive and its checksum file; returns the SHA-256 of the whole.
+
+    Args:
+        sequences: name in the archive ("train/bunker-train-0") -> folder.
+        archive: the file to write.
+        color_bits: mantissa bits kept of the colour, 1 to 10.
+        max_megabytes: refuse to grow beyond.
+        progress: called with the name and size of each member.
+
+    Raises:
+        JaxsrError: too large, or a sequence that cannot be read.
+    """
+    manifest: dict[str, Any] = {
+        "format": FORMAT, "version": VERSION, "color_bits": color_bits, "sequences": {}, "members": {},
+    }  # fmt: skip
+    total = 0
+    with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as file:
+        for name, folder in sequences.items():
+            seq = Sequence.open(folder)
+            manifest["sequences"][name] = json.loads((folder / "sequence.json").read_text())
+            for info, before, resolution, jitter in _images(seq.infos, seq.resolutions):
+                layers = _raw_layers(frame_file(folder, resolution, info.index))
+                blob = encode_frame(layers, info, before, jitter, color_bits)
+                member = f"{name}/{resolution}/{info.index:04d}"
+                file.writestr(zipfile.ZipInfo(member, _EPOCH), blob)
+                manifest["members"][member] = hashlib.sha256(blob).hexdigest()
+                total += len(blob)
+                progress(member, len(blob))
+                if total > max_megabytes * 1e6:
+                    raise JaxsrError(
+                        "the archive grows too large",
+                        where=archive,
+                        expected=f"at most {max_megabytes:g} MB",
+                        found=f"{total / 1e6:.0f} MB with {name} unfinished",
+                        fix="keep fewer bits of colour (--color-bits) or pack fewer sequences",
+                    )
+        file.writestr(zipfile.ZipInfo("manifest.json", _EPOCH), json.dumps(manifest, indent=1))
+    digest = file_digest(archive)
+    with atomic_path(archive.with_name(archive.name + ".sha256")) as temporary:
+        temporary.write_text(f"{digest}  {archive.name}\n")
+    return digest
+
+
+def file_digest(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def read_manifest(archive: Path) -> dict[str, Any]:
+    """The manifest of an archive.
+
+    Raises:
+        JaxsrError: missing, not an archive of ours, another version.
+    """
+    try:
+        with zipfile.ZipFile(archive) as file:
+            manifest = json.loads(file.read("manifest.json"))
+    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
+        raise JaxsrError("not an archive of a data set", where=archive, found=e) from e
+    if manifest.get("format") != FORMAT or manifest.get("version") != VERSION:
+        found = f"{manifest.get('format')} {manifest.get('version')}"
+        raise JaxsrError(
+            "another kind of archive", where=archive, expected=f"{FORMAT} {VERSION}", found=found
+        )
+    return manifest
+
+
+def verify(archive: Path) -> None:
+    """Compare the whole with ARCHIVE.sha256, where that exists."""
+    beside = archive.with_name(archive.name + ".sha256")
+    if beside.is_file() and beside.read_text().split()[0] != file_digest(archive):
+        raise JaxsrError("the checksum does not match", where=archive, expected=f"that of {beside.name}")
+
+
+def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folder: Path) -> Path:
+    """Write one sequence of the archive to a folder; resumes.
+
+    Raises:
+        JaxsrError: a member is missing or damaged.
+    """
+    head = dict(manifest["sequences"][name])
+    infos = []
+    for entry in head["frames"]:
+        camera = [
+            np.asarray(entry["camera"][key]) for key in ("world_from_view", "tan_half_fov", "lens_shift")
+        ]
+        jitter = (entry["jitter_px"][0], entry["jitter_px"][1])
+        infos.append(FrameInfo(entry["index"], jitter, entry["cut"], *camera))
+    writer = SequenceWriter(
+        folder,
+        name=head["name"],
+        size=tuple(head["size"]),
+        scales=head["scales"],
+        fps=head["fps"],
+        exposure=head["exposure"],
+        license=head["license"],
+        generator=head["generator"]
+        | {"quantised": f"{FORMAT} {VERSION}, {manifest['color_bits']} bits of colour"},
+        precision={"motion": "float"},
+    )
+    images: dict[int, dict[str, dict[str, np.ndarray]]] = {}
+    with zipfile.ZipFile(archive) as file:
+        for info, before, resolution, jitter in _images(infos, writer.resolutions):
+            if writer.has(info.index):
+                continue
+            member = f"{name}/{resolution}/{info.index:04d}"
+            try:
+                blob = file.read(member)
+            except (KeyError, zipfile.BadZipFile) as e:
+                raise JaxsrError(f"member {member!r} cannot be read", where=archive, found=e) from e
+            if hashlib.sha256(blob).hexdigest() != manifest["members"].get(member):
+                raise JaxsrError(
+                    f"member {member!r} is damaged", where=archive, fix="fetch the archive again"
+                )
+            images.setdefault(info.index, {})[resolution] = decode_frame(blob, info, before, jitter)
+            if len(images[info.index]) == len(writer.resolutions):
+                done = images.pop(info.index)
+                writer.write_frame(info, done.pop("hr"), {int(r[1:]): x for r, x in done.items()})
+    writer.close()
+    return folder

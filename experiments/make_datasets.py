@@ -1,0 +1,459 @@
+"""The data sets of the three scenes: rendered, measured, described and packed. Every verb resumes.
+
+    python experiments/make_datasets.py render --set sample|train|test [--budget-minutes N] [--out DIR]
+    python experiments/make_datasets.py floor [--scenes bunker forest docks]
+    python experiments/make_datasets.py card [--out DIR]
+    python experiments/make_datasets.py pack DIR ARCHIVE
+    python experiments/make_datasets.py unpack OUT [--archive FILE] [--search DIR]
+
+Sequences lie at `DIR/<set>/<scene>-<split>-<clip>`. `render` and `unpack` look for an archive (`*.jsrz`) in
+`--search`, then in `../shared/datasets` beside the repository, and never render what an archive holds.
+Training and test clips have camera paths and scene layouts of their own: they share no frames. All is
+deterministic for a seed, whatever the number of threads.
+"""
+
+import json
+import math
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+
+import numpy as np  # noqa: E402
+import tyro  # noqa: E402
+from rich.console import Console  # noqa: E402
+from rich.progress import (  # noqa: E402
+    BarColumn,
+    Progress,
+    ProgressColumn,
+    TaskID,
+    TextColumn,
+    TimeElapsedColumn,
+    TimeRemainingColumn,
+)
+
+from experiments import dataset_archive, dataset_card  # noqa: E402
+from jaxsr.errors import JaxsrError  # noqa: E402
+from jaxsr.io import blender  # noqa: E402
+from jaxsr.io.blender_convert import convert_color  # noqa: E402
+from jaxsr.io.blender_process import BlenderProcess, find_blender  # noqa: E402
+from jaxsr.io.exr import atomic_path, read_exr  # noqa: E402
+from jaxsr.io.sequence import Sequence  # noqa: E402
+from jaxsr.ops.color import to_display  # noqa: E402
+
+SCENES = ("bunker", "forest", "docks")
+CLIP_FRAMES = 12
+LICENSE = "CC0-1.0"
+FLOORS = ROOT / "experiments" / "results" / "noise_floor.json"
+CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsr" / "datasets"
+SHARED = ROOT.parent / "shared" / "datasets"
+# Bits of mantissa kept in the sample that ships with the package (results/sample_rounding.json).
+SAMPLE_BITS = {
+    "color": 6,
+    "normal": 6,
+    "base_color": 5,
+    "roughness": 6,
+    "metallic": 6,
+    "depth": 14,
+    "motion": 9,
+}
+
+Set = Literal["sample", "train", "test"]
+
+
+@dataclass(frozen=True)
+class Clip:
+    """One sequence of a set: frames 1 .. frames of the scene's clip."""
+
+    scene: str
+    split: str
+    clip: int
+    frames: int
+
+    @property
+    def name(self) -> str:
+        return f"{self.scene}-{self.split}-{self.clip}"
+
+
+@dataclass(frozen=True)
+class Render:
+    """Render a set, or take it from an archive."""
+
+    set: Set
+    scenes: tuple[str, ...] = SCENES
+    size: tuple[int, int] | None = None
+    """HR size; 384x216 for the sample, 512x288 for the others."""
+    scales: tuple[int, ...] = (2, 4)
+    clips: int | None = None
+    """Clips a scene, at most those of the set."""
+    frames: int | None = None
+    """Frames a clip, at most those of the set."""
+    samples: int | None = None
+    """Samples a pixel; the scene's own by default."""
+    seed: int = 0
+    budget_minutes: float = math.inf
+    threads: int | None = None
+    blender: Path | None = None
+    out: Path = CACHE
+    search: Path | None = None
+    """A folder with an archive, or an archive."""
+
+
+@dataclass(frozen=True)
+class Floor:
+    """Measure the truth's noise floor: two seeds, display-referred PSNR of half their squared difference."""
+
+    scenes: tuple[str, ...] = SCENES
+    splits: tuple[Literal["test", "train"], ...] = ("test", "train")
+    clips: tuple[int, ...] = (0,)
+    frames: tuple[int, ...] = (1, 6, 12)
+    size: tuple[int, int] = (384, 216)
+    samples: int | None = None
+    seeds: tuple[int, int] = (101, 202)
+    threads: int | None = None
+    blender: Path | None = None
+    results: Path = FLOORS
+
+
+@dataclass(frozen=True)
+class Card:
+    """Write docs/data_card.md and its pictures from what is there."""
+
+    out: Path = CACHE
+    floors: Path = FLOORS
+    docs: Path = ROOT / "docs"
+
+
+@dataclass(frozen=True)
+class Pack:
+    """Put the sequences of a folder into one archive."""
+
+    dir: Annotated[Path, tyro.conf.Positional]
+    archive: Annotated[Path, tyro.conf.Positional]
+    color_bits: int = 6
+    max_megabytes: float = 200.0
+
+
+@dataclass(frozen=True)
+class Unpack:
+    """Restore the sequences of an archive."""
+
+    out: Annotated[Path, tyro.conf.Positional] = CACHE
+    archive: Path | None = None
+    search: Path | None = None
+
+
+def clips_of(config: Render) -> list[Clip]:
+    """The sequences of a set, clip by clip over the scenes, so that a budget cuts all scenes alike."""
+    kinds = {
+        "sample": [("test", 0, 8), ("train", 0, 3)],
+        "train": [("train", clip, CLIP_FRAMES) for clip in range(5)],
+        "test": [("test", clip, CLIP_FRAMES) for clip in range(2)],
+    }[config.set]
+    kinds = [kind for kind in kinds if config.clips is None or kind[1] < config.clips]
+    limit = config.frames or CLIP_FRAMES
+    return [Clip(scene, split, c, min(n, limit)) for split, c, n in kinds for scene in config.scenes]
+
+
+class OutOfTime(Exception):
+    """The budget is spent; what is finished stays."""
+
+
+class _Rate(ProgressColumn):
+    def render(self, task: Any) -> str:  # type: ignore[override]
+        return f"{60 * task.speed:.2f} frames/min" if task.speed else "- frames/min"
+
+
+@contextmanager
+def bar(console: Console, total: float, what: str) -> Iterator[tuple[Progress, TaskID]]:
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.1f}/{task.total:.0f}"),
+    )
+    times = (_Rate(), TimeElapsedColumn(), TimeRemainingColumn())
+    with Progress(*columns, *times, console=console, speed_estimate_period=600) as progress:
+        yield progress, progress.add_task(what, total=total)
+
+
+def is_complete(folder: Path, clip: Clip) -> bool:
+    if not (folder / "sequence.json").is_file():
+        return False
+    indices = [info.index for info in Sequence.open(folder).infos]
+    return set(range(1, clip.frames + 1)) <= set(indices)
+
+
+def find_archives(search: Path | None) -> list[Path]:
+    """Archives in the given place, then in ../shared/datasets."""
+    places = [p for p in (search, SHARED) if p is not None]
+    if search is not None and not search.exists():
+        raise JaxsrError("no such file or folder", where=search)
+    return [a for p in places for a in ([p] if p.is_file() else sorted(p.glob("*.jsrz")))]
+
+
+def from_archive(config: Render, clip: Clip, folder: Path) -> bool:
+    """Unpacks the clip if an archive holds it at this size; tells whether it did."""
+    for archive in find_archives(config.search):
+        manifest = dataset_archive.read_manifest(archive)
+        name = f"{config.set}/{clip.name}"
+        head = manifest["sequences"].get(name)
+        if head is None or tuple(head["size"]) != size_of(config) or len(head["frames"]) < clip.frames:
+            continue
+        dataset_archive.unpack_sequence(archive, manifest, name, folder)
+        return True
+    return False
+
+
+def size_of(config: Render) -> tuple[int, int]:
+    return config.size or ((384, 216) if config.set == "sample" else (512, 288))
+
+
+def check_scenes(scenes: tuple[str, ...]) -> None:
+    for scene in scenes:
+        if not (ROOT / "experiments" / "scenes" / f"{scene}.py").is_file():
+            raise JaxsrError("no such scene", where="--scenes", expected=", ".join(SCENES), found=scene)
+
+
+def render_set(config: Render, console: Console) -> None:
+    """The verb `render`."""
+    check_scenes(config.scenes)
+    clips, base = clips_of(config), config.out / config.set
+    deadline = time.monotonic() + 60 * config.budget_minutes
+    with bar(console, sum(c.frames for c in clips), config.set) as (progress, task):
+        finished = 0.0
+        try:
+            for clip in clips:
+                progress.update(task, description=f"{config.set} {clip.name}")
+                if not is_complete(base / clip.name, clip) and not from_archive(
+                    config, clip, base / clip.name
+                ):
+                    _render_clip(config, clip, base / clip.name, deadline, progress, task, finished)
+                finished += clip.frames
+                progress.update(task, completed=finished)
+        except OutOfTime:
+            console.print(f"budget of {config.budget_minutes:g} minutes spent; run again to go on")
+
+
+def _render_clip(
+    config: Render, clip: Clip, folder: Path, deadline: float, progress: Progress, task: TaskID, before: float
+) -> None:
+    start, last = time.monotonic(), 0.0
+
+    def report(p: blender.Progress) -> None:
+        nonlocal last
+        last = p.cpu_seconds
+        progress.update(
+            task, completed=before + p.done_frames, description=f"{config.set} {clip.name} {p.message}"
+        )
+        if time.monotonic() > deadline:
+            raise OutOfTime
+
+    if time.monotonic() > deadline:
+        raise OutOfTime
+    arguments = {"seed": config.seed, "split": clip.split, "clip": clip.clip, "frames": CLIP_FRAMES}
+    try:
+        blender.render(
+            ROOT / "experiments" / "scenes" / f"{clip.scene}.py",
+            folder,
+            (1, clip.frames),
+            config.scales,
+            size=size_of(config),
+            samples=config.samples,
+            seed=config.seed,
+            threads=config.threads,
+            name=clip.name,
+            license=LICENSE,
+            scene_arguments=arguments,
+            round_bits=SAMPLE_BITS if config.set == "sample" else None,
+            precision={"motion": "half"} if config.set == "sample" else None,
+            blender=config.blender,
+            log=folder.parent / "logs" / f"{clip.name}.log",
+            progress=report,
+        )
+    finally:
+        add_cost(folder / "render.json", last, time.monotonic() - start)
+
+
+def add_cost(path: Path, cpu_seconds: float, wall_seconds: float) -> None:
+    """Sums what a sequence has cost over all runs."""
+    if not path.parent.is_dir():
+        return
+    old = json.loads(path.read_text()) if path.is_file() else {"cpu_seconds": 0.0, "wall_seconds": 0.0}
+    new = {
+        "cpu_seconds": round(old["cpu_seconds"] + cpu_seconds, 1),
+        "wall_seconds": round(old["wall_seconds"] + wall_seconds, 1),
+        "device": device(),
+    }
+    write_json(path, new)
+
+
+def write_json(path: Path, value: Any) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(json.dumps(value, indent=1, default=str) + "\n")
+
+
+def device() -> str:
+    info = Path("/proc/cpuinfo")
+    lines = info.read_text().splitlines() if info.is_file() else []
+    model = next(
+        (line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine()
+    )
+    return f"{model}, {os.cpu_count()} cores"
+
+
+def commit() -> str:
+    done = subprocess.run(
+        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True
+    )
+    return done.stdout.strip() or "unknown"
+
+
+# --- noise floor -----------------------------------------------------------------------------------------
+
+
+def floor_psnr(a: np.ndarray, b: np.ndarray, exposure: float) -> float:
+    """PSNR of one of two renders against the noiseless truth, estimated from their difference."""
+    shown = [np.asarray(to_display(x, exposure), np.float64) for x in (a, b)]
+    return float(-10 * np.log10(np.mean((shown[0] - shown[1]) ** 2) / 2))
+
+
+def _colors(
+    config: Floor, clip: Clip, seed: int, folder: Path, tick: Any
+) -> tuple[dict[int, np.ndarray], dict]:
+    """HR colour of the frames at one seed."""
+    arguments = {"seed": 0, "split": clip.split, "clip": clip.clip, "frames": CLIP_FRAMES}
+    script = ROOT / "experiments" / "scenes" / f"{clip.scene}.py"
+    job = {
+        "scene": {"script": str(script), "arguments": arguments},
+        "frames": [min(config.frames), max(config.frames)],
+        "skip": [f for f in range(min(config.frames), max(config.frames)) if f not in config.frames],
+        "size": config.size, "scales": [], "samples": config.samples, "seed": seed, "threads": config.threads,
+        "jitter_px": [[0.0, 0.0]], "color_only": True, "attended": True, "out": str(folder),
+    }  # fmt: skip
+    with BlenderProcess(find_blender(config.blender), job, folder, folder / "blender.log") as process:
+        described = process.scene()
+        process.answer({})
+        for event in process.events():
+            if event["event"] == "render":
+                tick()
+    files = {f: folder / f"{f:04d}_hr_color.exr" for f in config.frames}
+    return {f: convert_color(read_exr(path)[0]) for f, path in files.items()}, described
+
+
+def measure_floor(config: Floor, console: Console) -> None:
+    """The verb `floor`: one entry a scene, split and clip in the results, replaced when measured again."""
+    check_scenes(config.scenes)
+    clips = [Clip(s, split, c, 12) for s in config.scenes for split in config.splits for c in config.clips]
+    with bar(console, 2 * len(clips) * len(config.frames), "floor") as (progress, task):
+        for clip in clips:
+            progress.update(task, description=f"floor {clip.name}")
+            images = []
+            start = time.monotonic()
+            for seed in config.seeds:
+                with tempfile.TemporaryDirectory() as folder:
+                    images.append(_colors(config, clip, seed, Path(folder), lambda: progress.advance(task)))
+            (a, described), (b, _) = images
+            by_frame = {f: round(floor_psnr(a[f], b[f], described["exposure"]), 2) for f in config.frames}
+            mean_square = np.mean([10 ** (-psnr / 10) for psnr in by_frame.values()])
+            entry = {
+                "psnr_db": round(float(-10 * np.log10(mean_square)), 2),
+                "frames": by_frame,
+                "size": config.size,
+                **{key: described[key] for key in ("samples", "denoise", "bounces", "exposure", "blender")},
+                "scene_sha256": described["scene_sha256"],
+                "seeds": config.seeds,
+                "commit": commit(),
+                "device": device(),
+                "seconds": round(time.monotonic() - start, 1),
+                "time": datetime.now(UTC).isoformat(timespec="seconds"),
+            }
+            old = json.loads(config.results.read_text()) if config.results.is_file() else {}
+            write_json(config.results, dict(sorted((old | {clip.name: entry}).items())))
+            console.print(f"{clip.name}: {entry['psnr_db']} dB at {entry['samples']} samples")
+
+
+# --- archive ---------------------------------------------------------------------------------------------
+
+
+def pack_set(config: Pack, console: Console) -> None:
+    """The verb `pack`. Names in the archive are the paths below `dir`, with the set in front."""
+    folders = sorted(p.parent for p in config.dir.rglob("sequence.json"))
+    if not folders:
+        raise JaxsrError("no sequences", where=config.dir, expected="folders with sequence.json")
+    top = config.dir.resolve()
+    prefix = f"{top.name}/" if top.name in ("sample", "train", "test") else ""
+    names = {prefix + f.resolve().relative_to(top).as_posix(): f for f in folders}
+    members = 0
+    for folder in folders:
+        seq = Sequence.open(folder)
+        members += len(seq) * len(seq.resolutions)
+    with bar(console, members, "pack") as (progress, task):
+        digest = dataset_archive.pack(
+            names,
+            config.archive,
+            config.color_bits,
+            config.max_megabytes,
+            lambda name, size: progress.update(task, advance=1, description=f"pack {name}"),
+        )
+    console.print(f"{config.archive}: {config.archive.stat().st_size / 1e6:.1f} MB, sha256 {digest}")
+
+
+def unpack_set(config: Unpack, console: Console) -> None:
+    """The verb `unpack`."""
+    archives = [config.archive] if config.archive else find_archives(config.search)
+    if not archives:
+        raise JaxsrError("no archive", expected=f"*.jsrz in --search or {SHARED}", fix="or give --archive")
+    for archive in archives:
+        manifest = dataset_archive.read_manifest(archive)
+        dataset_archive.verify(archive)
+        with bar(console, len(manifest["sequences"]), "unpack") as (progress, task):
+            for name in manifest["sequences"]:
+                dataset_archive.unpack_sequence(archive, manifest, name, config.out / name)
+                progress.update(task, advance=1, description=f"unpack {name}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    console = Console(stderr=True)
+    command = tyro.conf.subcommand
+    config: Any = tyro.cli(
+        Annotated[Render, command("render")]  # type: ignore[arg-type]
+        | Annotated[Floor, command("floor")]
+        | Annotated[Card, command("card")]
+        | Annotated[Pack, command("pack")]
+        | Annotated[Unpack, command("unpack")],
+        args=arguments,
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    try:
+        if isinstance(config, Render):
+            render_set(replace(config, out=config.out.expanduser()), console)
+        elif isinstance(config, Floor):
+            measure_floor(config, console)
+        elif isinstance(config, Card):
+            print(dataset_card.write(**asdict(config)))
+        elif isinstance(config, Pack):
+            pack_set(config, console)
+        else:
+            unpack_set(config, console)
+    except JaxsrError as e:
+        console.print(f"error: {e}", style="red", markup=False, highlight=False)
+        return 2
+    except KeyboardInterrupt:
+        console.print("stopped; run again to go on")
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
