@@ -11,22 +11,25 @@ frame (white, yellow, blue, red) and shines on pipes: history shows colours that
 
 import math
 import random
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 
 import bpy
 from mathutils import Matrix, Vector
 
-from experiments.scenes import common as co
-from experiments.scenes.bunker_kit import Part, bend, library, sign, spin
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import common as co
+from bunker_kit import Part, bend, library, sign, spin
 
 SETTINGS = {
     "test_samples": 48,
     "train_samples": 16,
     "denoise": True,
-    "max_bounces": 2,
+    "max_bounces": 1,
     "diffuse_bounces": 0,
     "glossy_bounces": 1,
-    "exposure": 1.0,
+    "exposure": 1.25,
 }
 
 FLICKER = ((1.0, 0.96, 0.90), (1.0, 0.72, 0.10), (0.12, 0.28, 1.0), (1.0, 0.07, 0.04))
@@ -616,14 +619,14 @@ def tube_lamp(p: Place, x: float, y: float, z: float, along: int, watts: float, 
     size[along] = length - 0.1
     g.block((x, y, z - 0.09), (*size, 0.06), "lamp_cold")
     g.object("tube_lamp")
-    ob = co.lamp((x, y, z - 0.14), COLD, watts, 0.0, 158.0, (x, y, z - 1))
+    ob = co.lamp((x, y, z - 0.14), COLD, watts, 0.0, 118.0, (x, y, z - 1))
     ob.data.spot_blend = 0.35
 
 
 def flicker_lamp(p: Place, at: tuple, target: tuple, watts: float, colors: list[tuple]) -> None:
     """The lamp whose colour is drawn anew on every frame; the bulb's glass changes with it."""
     way = Vector(target) - Vector(at)
-    ob = cage_lamp(p, at, way, watts, glass="flicker", cone=110.0)
+    ob = cage_lamp(p, at, way, watts, glass="flicker", cone=84.0)
     co.key_values(ob.data, "color", colors)
     tree = p.mats["flicker"].node_tree
     name = co.principled(p.mats["flicker"]).name
@@ -693,16 +696,16 @@ def corridor(p: Place, colors: list[tuple], lit: bool) -> None:
     fan(p, (-15.75, -22.2, 1.7), "X", 0.95, rng.choice((-1, 1)) * rng.uniform(0.10, 0.16))
     if not lit:
         return
-    for y in (-18.0, -12.2, -6.4, -1.6):
-        tube_lamp(p, -side * 0.3, y + rng.uniform(-0.4, 0.4), 3.28, 1, rng.uniform(75, 110))
-    for x in (-13.0, -7.5):
-        tube_lamp(p, x, -22.2, 3.28, 0, rng.uniform(75, 110))
+    for y in (-19.0, -13.4, -7.8, -2.2):
+        tube_lamp(p, -side * 0.3, y + rng.uniform(-0.4, 0.4), 3.28, 1, rng.uniform(120, 170))
+    for x in (-13.0, -7.4):
+        tube_lamp(p, x, -22.2, 3.28, 0, rng.uniform(120, 170))
     near = p.path[0]
     ahead = near.y + rng.uniform(3.2, 4.2) if near.y > -20 else -17.5
     flicker_lamp(p, (-side * 0.9, min(ahead, -1.0), 2.55), (side * 1.9, min(ahead, -1.0) + 0.3, 1.5), 120, colors)
 
 
-def hall(p: Place, colors: list[tuple], lit: bool) -> None:
+def hall(p: Place, colors: list[tuple], lit: str) -> None:
     rng = p.rng
     columns = p.part()
     for x in (-4.9, 4.3):
@@ -769,12 +772,13 @@ def hall(p: Place, colors: list[tuple], lit: bool) -> None:
         sign(text, 0.8, p.mats["yellow"], (x, 0.32, z), (math.pi / 2, 0, math.pi))
     if not lit:
         return
+    if lit == "door":  # seen through the corridor's end only
+        cage_lamp(p, (0, 6.0, 6.0), (0, 0, -1), 700, cone=90)
+        return
     back = co.lamp((0.5, 29.0, 8.5), (1.0, 0.86, 0.62), 5200, 0.0, 60.0, (0, 20.0, 0.5))
     back.data.spot_blend = 0.2
     for x, y in ((-1.0, 3.2), (0.8, 9.4), (-1.0, 15.6), (0.8, 21.8)):
-        cage_lamp(p, (x, y, 6.0), (0, 0, -1), rng.uniform(420, 560), cone=125)
-    for y in (5.0, 13.0, 21.0):
-        cage_lamp(p, (7.9, y, 2.9), (-1, 0, -0.6), 90, COLD, "lamp_cold", 140)
+        cage_lamp(p, (x, y, 6.0), (0, 0, -1), rng.uniform(600, 760), cone=96)
     near = p.path[len(p.path) // 2]
     y = min(max(near.y + (4 if p.path[-1].y > p.path[0].y else -4), 2), 24)
     y = y if not 7.5 < y < 16.5 else (6.2 if y < 12 else 17.5)
@@ -815,7 +819,7 @@ def pumps(p: Place, colors: list[tuple], lit: bool) -> None:
     if not lit:
         return
     for x in (-19.6, -15.4, -11.2):
-        cage_lamp(p, (x, 11.2, 4.95), (0, 0.1, -1), rng.uniform(230, 300), cone=140)
+        cage_lamp(p, (x, 11.2, 4.95), (0, 0.1, -1), rng.uniform(380, 480), cone=100)
     near = p.path[len(p.path) // 2]
     flicker_lamp(p, (near.x + rng.uniform(-1.5, 1.5), 12.3, 4.2), (near.x, 17.2, 1.6), 420, colors)
 
@@ -839,8 +843,6 @@ def build(*, seed: int, split: str, clip: int, frames: int) -> None:
     place = Place(library(), rng, [matrix.translation for matrix in matrices], frames)
     shell(place)
     corridor(place, colors, lit=kind in ("corridor", "turn"))
-    hall(place, colors, lit=kind in ("hall", "gallery", "store", "corridor"))
+    hall(place, colors, lit={"corridor": "door", "hall": "all", "gallery": "all", "store": "all"}.get(kind, ""))
     pumps(place, colors, lit=kind == "pumps")
-    if kind == "hall":
-        co.lamp((-12.0, 12.0, 4.6), WARM, 300, 0.0, 130.0, (-12, 12, 0))
     bpy.context.view_layer.update()

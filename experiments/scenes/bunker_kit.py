@@ -1,21 +1,25 @@
 """Building blocks of the bunker scene: materials with a noise-free ambient term, and the mesh builder `Part`.
 
 The ambient light is emission (base colour times a sky/ground gradient times short-range occlusion) instead of
-diffuse bounces: the truth stays clean at few samples. UV coordinates are metres on every surface.
+diffuse bounces: the truth stays clean at few samples. For the same reason diffuse rays see no emission, and glossy
+rays see lamps dimmed (rare hits of bright lamps are what fireflies are made of). UV coordinates are metres on every surface.
 """
 
 import math
+import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import bpy
 from mathutils import Matrix, Vector
 
-from experiments.scenes import common as co
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import common as co
 
 Point = Sequence[float]
 
-AMBIENT_UP = (0.105, 0.135, 0.165)
-AMBIENT_DOWN = (0.085, 0.070, 0.055)
+AMBIENT_UP = (0.24, 0.30, 0.36)
+AMBIENT_DOWN = (0.20, 0.17, 0.14)
 
 
 # --- materials ------------------------------------------------------------------------------------------
@@ -48,11 +52,12 @@ def ambient_group() -> bpy.types.NodeTree:
 
     light = mix("MIX", height.outputs["Result"], (*AMBIENT_DOWN, 1), (*AMBIENT_UP, 1))
     occlusion = new("ShaderNodeAmbientOcclusion")
-    occlusion.samples, occlusion.inputs["Distance"].default_value = 4, 0.8
+    occlusion.samples, occlusion.inputs["Distance"].default_value = 2, 0.9
     light = mix("MULTIPLY", 1.0, light, occlusion.outputs["Color"])
     light = mix("MULTIPLY", 1.0, light, source.outputs["Color"])
     dim = mix("MULTIPLY", 1.0, light, (0.45, 0.45, 0.45, 1))
     light = mix("MIX", source.outputs["Metallic"], light, dim)
+    light = mix("MIX", new("ShaderNodeLightPath").outputs["Is Diffuse Ray"], light, (0, 0, 0, 1))
     link(light, sink.inputs["Light"])
     return tree
 
@@ -200,9 +205,18 @@ def wood(name: str, color: co.Color) -> bpy.types.Material:
 
 def glow(name: str, color: co.Color, strength: float) -> bpy.types.Material:
     """The lit glass of a lamp: it looks bright; point and spot lamps beside it do the lighting."""
-    mat = co.material(name, (0.8, 0.8, 0.8), 0.4, emission=color, emission_strength=strength)
+    mat = co.material(name, (0.8, 0.8, 0.8), 0.4, emission=color)
     mat.cycles.emission_sampling = "NONE"
+    n = co.Nodes(mat)
+    n.set("Emission Strength", seen(n, strength, min(strength, 1.6)))
     return mat
+
+
+def seen(n: co.Nodes, camera: float, glossy: float) -> bpy.types.NodeSocket:
+    """An emission strength by the kind of ray that looks: the camera's, a reflection's, none for diffuse rays."""
+    path = n.node("ShaderNodeLightPath")
+    direct = n.math("MULTIPLY", path.outputs["Is Camera Ray"], camera)
+    return n.math("ADD", direct, n.math("MULTIPLY", path.outputs["Is Glossy Ray"], glossy))
 
 
 def screen(name: str, color: co.Color, rows: float, shift: float) -> bpy.types.Material:
@@ -220,7 +234,7 @@ def screen(name: str, color: co.Color, rows: float, shift: float) -> bpy.types.M
     n.set("Base Color", (0.02, 0.025, 0.03))
     n.set("Roughness", 0.18)
     n.set("Emission Color", n.mix(1.0, n.mix(0.93, (0.2, 0.25, 0.3), text), tint, "MULTIPLY"))
-    n.set("Emission Strength", 1.4)
+    n.set("Emission Strength", seen(n, 1.4, 0.8))
     return mat
 
 
