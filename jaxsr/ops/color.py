@@ -6,7 +6,7 @@ those of sRGB throughout; no gamut is converted.
 
 Out of range: below 0 counts as 0 with no gradient (the curves are one-sided, with their right derivative
 at 0), +inf as very large, and NaN stays NaN, so that a broken pixel is seen and not hidden. Gradients are
-finite at 0 and at any finite value.
+finite at 0 and at any finite value whose result does not overflow.
 """
 
 import functools
@@ -109,7 +109,7 @@ def to_display(
 @jax.jit
 def from_display(display: Float[Array, "*n"], exposure: float | Float[Array, ""] = 1.0) -> Float[Array, "*n"]:
     """Scene-linear colour of DISPLAY colour: exact below saturation, at most `7.24 / exposure`."""
-    return inverse_tone_map(linear_from_srgb(display), "aces") / exposure
+    return inverse_tone_map(linear_from_srgb(_ceil(display, 1.0)), "aces") / exposure
 
 
 @jax.jit

@@ -21,7 +21,7 @@ from jaxsr.errors import JaxsrError
 def demodulation_divisor(
     base_color: Float[Array, "*n 3"],
     *,
-    specular: float | Float[Array, "*n 1"] | None = None,
+    specular: float | Float[Array, ""] | Float[Array, "*n 1"] | None = None,
     metallic: Float[Array, "*n 1"] | None = None,
     eps: float = 0.02,
 ) -> Float[Array, "*n 3"]:
@@ -52,7 +52,7 @@ def demodulate(
     color_linear: Float[Array, "*n 3"],
     base_color: Float[Array, "*n 3"],
     *,
-    specular: float | Float[Array, "*n 1"] | None = None,
+    specular: float | Float[Array, ""] | Float[Array, "*n 1"] | None = None,
     metallic: Float[Array, "*n 1"] | None = None,
     eps: float = 0.02,
 ) -> Float[Array, "*n 3"]:
@@ -65,7 +65,7 @@ def modulate(
     lighting: Float[Array, "*n 3"],
     base_color: Float[Array, "*n 3"],
     *,
-    specular: float | Float[Array, "*n 1"] | None = None,
+    specular: float | Float[Array, ""] | Float[Array, "*n 1"] | None = None,
     metallic: Float[Array, "*n 1"] | None = None,
     eps: float = 0.02,
 ) -> Float[Array, "*n 3"]:

@@ -1,0 +1,86 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from jaxsr import ops
+from jaxsr.errors import JaxsrError
+from tests.reference import demodulation as reference
+from tests.transforms import assert_jit_and_batch
+
+
+def _scene(seed, size):
+    """Colour, base colour with black pixels and black channels, specular, metallic."""
+    rng = np.random.default_rng(seed)
+    base = (
+        rng.uniform(0, 1, (*size, 3)) * rng.choice([0, 1, 1], (*size, 3)) * rng.choice([0, 1, 1], (*size, 1))
+    )
+    color = 10.0 ** rng.uniform(-3, 3, (*size, 3))
+    arrays = color, base, rng.uniform(0, 1, (*size, 1)), rng.uniform(0, 1, (*size, 1))
+    return [jnp.asarray(a, jnp.float32) for a in arrays]
+
+
+@given(size=st.sampled_from([(1, 1), (4, 5)]), seed=st.integers(0, 10**6), kind=st.integers(0, 2))
+def test_divisor_is_the_loop_and_modulate_inverts(size, seed, kind):
+    color, base, specular, metallic = _scene(seed, size)
+    extra = [{}, {"specular": specular}, {"specular": specular, "metallic": metallic}][kind]
+    divisor = reference.divisor(base, extra.get("specular"), extra.get("metallic"), 0.02)
+    lighting = ops.demodulate(color, base, **extra)
+    np.testing.assert_allclose(ops.demodulation_divisor(base, **extra), divisor, rtol=1e-6)
+    np.testing.assert_allclose(lighting, np.asarray(color) / divisor, rtol=1e-6)
+    np.testing.assert_allclose(ops.modulate(lighting, base, **extra), color, rtol=3e-7)
+
+
+def test_sky_and_missing_base_keep_their_colour():
+    color = jnp.asarray([[[5.0, 6.0, 7.0], [1.0, 2.0, 3.0]]])
+    base = jnp.asarray([[[0.0, 0.0, 0.0], [jnp.nan, jnp.nan, jnp.nan]]])
+    np.testing.assert_array_equal(ops.demodulate(color, base), color)
+    np.testing.assert_array_equal(ops.modulate(color, base), color)
+
+
+def test_texture_leaves_the_lighting():
+    rng = np.random.default_rng(0)
+    base = jnp.asarray(rng.uniform(0.05, 1, (6, 7, 3)), jnp.float32)
+    lighting = jnp.full((6, 7, 3), 1.7, jnp.float32)
+    np.testing.assert_allclose(ops.demodulate(base * lighting, base), lighting, rtol=1e-6)
+
+
+def test_a_float_is_a_constant_specular_and_metal_has_none():
+    color, base, specular, _ = _scene(1, (2, 3))
+    constant = ops.demodulate(color, base, specular=jnp.full_like(specular, 0.5))
+    np.testing.assert_allclose(ops.demodulate(color, base, specular=0.5), constant, rtol=1e-6)
+    metal = ops.demodulate(color, base, specular=0.5, metallic=jnp.ones_like(specular))
+    np.testing.assert_allclose(metal, ops.demodulate(color, base), rtol=1e-6)
+
+
+@pytest.mark.parametrize("fn", [ops.demodulate, ops.modulate])
+def test_gradients_are_finite_and_bounded(fn):
+    color, base, specular, metallic = _scene(2, (5, 6))
+    base = base.at[0].set(0).at[1, :, 1].set(0).at[2].set(0.02)
+    gradients = jax.grad(lambda c, b, s, m: fn(c, b, specular=s, metallic=m).sum(), argnums=(0, 1, 2, 3))(
+        color, base, specular, metallic
+    )
+    for gradient in gradients:
+        assert np.isfinite(gradient).all()
+    assert np.abs(gradients[0]).max() <= (1 / 0.02 if fn is ops.demodulate else 1.2)
+
+
+def test_gradient_is_the_quotient_rule():
+    color, base = jnp.asarray([[[2.0, 3.0, 4.0]]]), jnp.asarray([[[0.5, 0.01, 0.25]]])
+    gradient = jax.grad(lambda b: ops.demodulate(color, b).sum())(base)
+    # The middle channel sits on the guard: constant.
+    np.testing.assert_allclose(gradient[0, 0], [-2.0 / 0.25, 0.0, -4.0 / 0.0625], rtol=1e-6)
+
+
+def test_jit_and_batch():
+    arrays = _scene(3, (2, 3, 4))
+    assert_jit_and_batch(lambda c, b, s, m: ops.demodulate(c, b, specular=s, metallic=m), *arrays)
+    assert_jit_and_batch(ops.modulate, *arrays[:2])
+
+
+def test_bad_guard_is_named():
+    color, base, *_ = _scene(4, (1, 1))
+    with pytest.raises(JaxsrError, match="positive"):
+        ops.demodulate(color, base, eps=0.0)
