@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsr.frames import Frame
@@ -20,7 +21,8 @@ class Method(NamedTuple):
 
     `step(net, state, frame) -> state, image` makes the HR linear colour of one frame; it serves streaming,
     `jax.lax.scan`, evaluation and export alike. It never sees the truth. Where `frame.cut` is set it ignores
-    the state; where `frame.rendered` is not, it extrapolates and ignores `frame.color_linear`.
+    the state; where `frame.rendered` is not, it extrapolates and ignores `frame.color_linear`. Nothing can be
+    made of a frame that is both cut and not rendered: who schedules the frames renders the first of a shot.
     """
 
     name: str
@@ -33,12 +35,14 @@ class Method(NamedTuple):
 
 
 def by_rendered(
+    init: Callable[[Frame], State],
     upscale: Callable[[Net, State, Frame], tuple[State, Array]],
     extrapolate: Callable[[Net, State, Frame], tuple[State, Array]],
 ) -> Step:
-    """A step that upscales rendered frames and extrapolates the others."""
+    """A step that upscales rendered frames, extrapolates the others, and starts anew at a cut."""
 
     def step(net: Net, state: State, frame: Frame) -> tuple[State, Array]:
+        state = jax.tree.map(lambda new, old: jnp.where(frame.cut, new, old), init(frame), state)
         return jax.lax.cond(frame.rendered, upscale, extrapolate, net, state, frame)
 
     return step

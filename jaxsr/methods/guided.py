@@ -85,6 +85,6 @@ def method(options: Options | None = None, taau_options: taau.Options | None = N
         "guided",
         "TAAU; G-buffer-guided reprojection of the lighting where nothing was rendered",
         init,
-        by_rendered(upscale, extrapolate),
+        by_rendered(init, upscale, extrapolate),
         upscaler.needs | {"hr.base_color", "hr.normal"},
     )

@@ -28,4 +28,4 @@ def method(mode: str) -> Method:
         return state, state
 
     summary = f"{mode} interpolation of the current frame; repeats it where nothing was rendered"
-    return Method(mode, summary, init, by_rendered(upscale, hold), frozenset({"lr.color"}))
+    return Method(mode, summary, init, by_rendered(init, upscale, hold), frozenset({"lr.color"}))

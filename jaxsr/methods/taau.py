@@ -41,9 +41,9 @@ from jaxsr.ops.resampling import pixel_grid
 class Options:
     """Constants of TAAU; the defaults are measured by `experiments/tune_classical.py`."""
 
-    kernel_sigma: float = 0.5
+    kernel_sigma: float = 0.35
     """Reconstruction kernel, in LR pixels."""
-    sample_sigma: float = 0.5
+    sample_sigma: float = 0.35
     """How near to a pixel a sample must fall to count in full, in HR pixels."""
     floor: float = 0.02
     """Least weight of the current frame: a history is never final."""
@@ -142,7 +142,7 @@ def fetch_history(
         at = base + jnp.array((i, j), base.dtype)[None, None]
         tap = sample(packed, at, mode="nearest", boundary="clamp")
         inside = jnp.all(
-            (at >= 0) & (at <= jnp.array((width - 1, height - 1))[None, None]), -1, keepdims=True
+            (at >= 0) & (at <= jnp.array((width - 1, height - 1), base.dtype)[None, None]), -1, keepdims=True
         )
         agrees = inside & (jnp.abs(tap[..., 4:] - inverse) <= tolerance)
         share = (fraction[..., :1] if i else 1 - fraction[..., :1]) * (
@@ -156,8 +156,7 @@ def fetch_history(
     sharp = backward_warp(state.image, frame.hr.motion_px, mode="bicubic")
     image = jnp.where(all_agree & (agreeing > 0.999), sharp, some[..., :3])
     # A few agreeing taps far from p are worth less than four around it.
-    weight = jnp.where(frame.cut, 0, some[..., 3:4] * agreeing)
-    return jnp.maximum(image, 0), weight
+    return jnp.maximum(image, 0), some[..., 3:4] * agreeing
 
 
 def _slope(inverse_depth: Float[Array, "H W 1"]) -> Float[Array, "H W 1"]:
@@ -204,6 +203,6 @@ def method(options: Options | None = None) -> Method:
         "taau",
         "temporal upsampling of jittered frames; plain backward warp where nothing was rendered",
         init,
-        by_rendered(upscale, extrapolate),
+        by_rendered(init, upscale, extrapolate),
         frozenset({"lr.color", "hr.depth", "hr.motion"}),
     )

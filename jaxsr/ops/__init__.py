@@ -35,6 +35,7 @@ from jaxsr.ops.masks import (
     position_mask,
     stencil_mask,
 )
+from jaxsr.ops.reprojection import reproject
 from jaxsr.ops.resampling import (
     depth_to_space,
     pixel_grid,
@@ -74,6 +75,7 @@ __all__ = [
     "positions_from_jittered_motion",
     "positions_from_motion",
     "project",
+    "reproject",
     "resize",
     "rgb_from_ycocg",
     "sample",
