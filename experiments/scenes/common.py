@@ -283,8 +283,7 @@ def sky(
 ) -> bpy.types.World:
     """World with a vertical gradient: stops of (sine of the elevation in -1..1, linear RGB).
 
-    With `light`, only the camera sees the gradient and everything else gets the flat colour `light`
-    (noise-free to sample).
+    With `light`, the camera and reflections see the gradient and diffuse surfaces get the flat colour `light`.
     """
     world = bpy.data.worlds.new("sky")
     bpy.context.scene.world = world
@@ -310,7 +309,11 @@ def sky(
     if light is not None:
         flat, mix = new("ShaderNodeBackground"), new("ShaderNodeMixShader")
         flat.inputs["Color"].default_value = (*light[:3], 1.0)
-        link(new("ShaderNodeLightPath").outputs["Is Camera Ray"], mix.inputs[0])
+        rays, seen = new("ShaderNodeLightPath").outputs, new("ShaderNodeMath")
+        seen.operation = "MAXIMUM"
+        link(rays["Is Camera Ray"], seen.inputs[0])
+        link(rays["Is Glossy Ray"], seen.inputs[1])
+        link(seen.outputs[0], mix.inputs[0])
         link(flat.outputs[0], mix.inputs[1])
         link(shader, mix.inputs[2])
         shader = mix.outputs[0]

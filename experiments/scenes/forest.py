@@ -18,13 +18,13 @@ import common
 import forest_parts as parts
 
 SETTINGS = {
-    "test_samples": 64,
-    "train_samples": 16,
+    "test_samples": 32,
+    "train_samples": 8,
     "denoise": False,
     "max_bounces": 2,
     "diffuse_bounces": 0,
     "glossy_bounces": 1,
-    "exposure": 1.0,
+    "exposure": 1.3,
 }
 
 SHOTS = ("walk", "dolly", "low", "orbit", "back")
@@ -60,7 +60,10 @@ class Terrain:
     """The winding path and the ground's height."""
 
     def __init__(self, rng: random.Random):
-        self.waves = [(rng.uniform(0.9, 1.5), rng.uniform(0.16, 0.22), rng.uniform(0, math.tau)), (0.5, 0.43, 1.3)]
+        self.waves = [
+            (rng.uniform(0.9, 1.5), rng.uniform(0.16, 0.22), rng.uniform(0, math.tau)),
+            (0.5, 0.43, 1.3),
+        ]
         self.offset = rng.uniform(0, 500)
         self.origin = sum(a * math.sin(p) for a, _, p in self.waves)
         self.pond: tuple[Vector, float] | None = None
@@ -78,9 +81,16 @@ class Terrain:
         """Ground height: level path, banks beside it, a hollow where the pond is."""
         off = self.from_path(x, y)
         rolling = 0.55 * noise.noise((x * 0.13, y * 0.13, self.offset))
-        bumps = 0.16 * noise.noise((x * 0.5, y * 0.5, self.offset + 9)) + 0.05 * noise.noise((x * 1.6, y * 1.6, 3))
+        bumps = 0.16 * noise.noise((x * 0.5, y * 0.5, self.offset + 9)) + 0.05 * noise.noise(
+            (x * 1.6, y * 1.6, 3)
+        )
         open_ground = smooth(0.7, 1.9, off)
-        z = rolling + bumps * (0.25 + 0.75 * open_ground) + 0.45 * smooth(1.4, 7.0, off) - 0.10 * (1 - open_ground)
+        z = (
+            rolling
+            + bumps * (0.25 + 0.75 * open_ground)
+            + 0.45 * smooth(1.4, 7.0, off)
+            - 0.10 * (1 - open_ground)
+        )
         if self.pond is not None:
             centre, radius = self.pond
             far = (Vector((x, y)) - centre).length / radius
@@ -90,7 +100,11 @@ class Terrain:
 
 def plan(rng: random.Random, split: str, clip: int, frames: int, terrain: Terrain) -> Shot:
     """The camera's move: test clips start from another kind than train clips of the same number do."""
-    kind = SHOTS[(clip + (2 if split == "test" else 0)) % len(SHOTS)] if split == "test" else SHOTS[clip % len(SHOTS)]
+    kind = (
+        SHOTS[(clip + (2 if split == "test" else 0)) % len(SHOTS)]
+        if split == "test"
+        else SHOTS[clip % len(SHOTS)]
+    )
     side = rng.choice((-1, 1))
     step = frames + 1
     steps = range(5)
@@ -167,7 +181,9 @@ class Forest:
         rng = self.rng
         distance = near + (far - near) * rng.random() ** 0.9
         angle = self.shot.heading + rng.uniform(-half_angle, half_angle)
-        return self.shot.centre.x + distance * math.cos(angle), self.shot.centre.y + distance * math.sin(angle)
+        return self.shot.centre.x + distance * math.cos(angle), self.shot.centre.y + distance * math.sin(
+            angle
+        )
 
     def sway(self, ob: bpy.types.Object, degrees: float, period: float) -> None:
         """Key a rigid rocking about the object's own origin; neighbours move alike, as in gusts."""
@@ -199,16 +215,26 @@ def plant_trees(forest: Forest, sun_from: Vector, palette: random.Random) -> Non
     branches = [parts.branch(palette, needles, grey, length) for length in (4.4, 3.6, 2.8)]
     clumps = [parts.clump(palette, needles) for _ in range(3)]
     heading = shot.heading
+    crowns: list[bpy.types.Object] = []
 
     spots: list[tuple[float, float, int, float]] = []
     left = rng.choice((-1, 1))
-    for sign, distance, angle, kind in ((left, 6.3, 0.33, 0), (-left, 8.8, 0.36, 1), (left, 12.0, 0.13, 2), (-left, 6.0, 0.56, 3)):
+    for sign, distance, angle, kind in (
+        (left, 6.3, 0.33, 0),
+        (-left, 8.8, 0.36, 1),
+        (left, 12.0, 0.13, 2),
+        (-left, 6.0, 0.56, 3),
+    ):
         for _ in range(30):  # composed trees: large ones on both sides of the view
             a = heading + sign * (angle + rng.uniform(-0.08, 0.08))
             d = distance * rng.uniform(0.85, 1.2)
             x, y = shot.centre.x + d * math.cos(a), shot.centre.y + d * math.sin(a)
             radius = trunks[kind][1]
-            if terrain.from_path(x, y) > 1.3 + radius and forest.off_camera(x, y) > 1.8 + radius and forest.free(x, y, radius + 1.6):
+            if (
+                terrain.from_path(x, y) > 1.3 + radius
+                and forest.off_camera(x, y) > 1.8 + radius
+                and forest.free(x, y, radius + 1.6)
+            ):
                 spots.append((x, y, kind, rng.uniform(0.95, 1.1)))
                 forest.taken.append((Vector((x, y)), radius * 1.2))
                 break
@@ -242,25 +268,69 @@ def plant_trees(forest: Forest, sun_from: Vector, palette: random.Random) -> Non
             reach = radius * scale * 0.5
             where = foot + Vector((math.cos(angle) * reach, math.sin(angle) * reach, z))
             size = rng.uniform(0.75, 1.15) * (1.15 - 0.02 * z)
-            ob = common.add(rng.choice(branches), location=where, rotation=(rng.uniform(-0.15, 0.25), 0, angle - math.pi / 2), scale=size)
+            ob = common.add(
+                rng.choice(branches),
+                location=where,
+                rotation=(rng.uniform(-0.15, 0.25), 0, angle - math.pi / 2),
+                scale=size,
+            )
+            crowns.append(ob)
             if distance < 24:
                 forest.sway(ob, rng.uniform(1.2, 2.4), 30)
+    open_canopy(forest, crowns, sun_from)
     for _ in range(64):  # the wall of leaves behind everything
         x, y = forest.polar(24, 46, 0.68)
         if terrain.from_path(x, y) > 2.5:
             where = forest.at(x, y) + Vector((0, 0, rng.uniform(0.5, 5.5)))
-            common.add(rng.choice(clumps), location=where, rotation=(0, 0, rng.uniform(0, 6)), scale=rng.uniform(0.7, 1.3))
+            common.add(
+                rng.choice(clumps),
+                location=where,
+                rotation=(0, 0, rng.uniform(0, 6)),
+                scale=rng.uniform(0.7, 1.3),
+            )
+
+
+def open_canopy(forest: Forest, crowns: list[bpy.types.Object], sun_from: Vector) -> None:
+    """Take away branches between the sun and some pools of light on the ground in view."""
+    bpy.context.view_layer.update()
+    graph, scene = bpy.context.evaluated_depsgraph_get(), bpy.context.scene
+    names = {ob.name for ob in crowns}
+    blocking: set[str] = set()
+    for _ in range(200):
+        x, y = forest.polar(1.5, 17, 0.6)
+        if noise.noise((x * 0.30, y * 0.30, forest.terrain.offset + 50)) < -0.12:
+            continue
+        start, hits = forest.at(x, y) + Vector((0, 0, 0.3)), set()
+        for _ in range(40):
+            found, where, _, _, ob, _ = scene.ray_cast(graph, start, sun_from)
+            if not found:
+                blocking |= hits
+                break
+            if ob.name not in names:
+                break  # a trunk: this point stays in shade
+            hits.add(ob.name)
+            start = where + sun_from * 0.02
+    for name in sorted(blocking):
+        bpy.data.objects.remove(bpy.data.objects[name])
 
 
 def plant_undergrowth(forest: Forest, palette: random.Random) -> None:
     """Ferns, maples, grass, sorrel, litter, rocks and logs."""
     rng, terrain, shot = forest.rng, forest.terrain, forest.shot
     stem = parts.leaf_material("stem", [(0.05, 0.035, 0.018), (0.10, 0.08, 0.03)], 0.7)
-    frond = parts.leaf_material("fern", [(0.040, 0.105, 0.020), (0.080, 0.185, 0.028), (0.150, 0.260, 0.040), (0.26, 0.30, 0.06)])
-    maple = parts.leaf_material("maple", [(0.075, 0.20, 0.030), (0.16, 0.30, 0.040), (0.32, 0.38, 0.050), (0.50, 0.33, 0.040)])
+    frond = parts.leaf_material(
+        "fern", [(0.040, 0.105, 0.020), (0.080, 0.185, 0.028), (0.150, 0.260, 0.040), (0.26, 0.30, 0.06)]
+    )
+    maple = parts.leaf_material(
+        "maple", [(0.075, 0.20, 0.030), (0.16, 0.30, 0.040), (0.32, 0.38, 0.050), (0.50, 0.33, 0.040)]
+    )
     blade = parts.leaf_material("grass", [(0.07, 0.14, 0.025), (0.16, 0.25, 0.045), (0.30, 0.31, 0.09)], 0.55)
-    clover = parts.leaf_material("sorrel", [(0.05, 0.15, 0.028), (0.10, 0.24, 0.040), (0.17, 0.33, 0.06)], 0.6)
-    dead = parts.leaf_material("litter", [(0.11, 0.05, 0.018), (0.27, 0.12, 0.03), (0.42, 0.22, 0.05), (0.50, 0.34, 0.10)], 0.7)
+    clover = parts.leaf_material(
+        "sorrel", [(0.05, 0.15, 0.028), (0.10, 0.24, 0.040), (0.17, 0.33, 0.06)], 0.6
+    )
+    dead = parts.leaf_material(
+        "litter", [(0.11, 0.05, 0.018), (0.27, 0.12, 0.03), (0.42, 0.22, 0.05), (0.50, 0.34, 0.10)], 0.7
+    )
     stone = parts.rock_material()
     near_ferns = [parts.fern(palette, frond, stem) for _ in range(3)]
     far_ferns = [parts.fern(palette, frond, stem, 9, 6) for _ in range(2)]
@@ -283,7 +353,10 @@ def plant_undergrowth(forest: Forest, palette: random.Random) -> None:
         turn = shot.heading + math.pi / 2 + rng.uniform(-0.7, 0.7)
         along = Vector((math.cos(turn), math.sin(turn)))
         spots = [Vector((x, y)) + along * s for s in (-3, -1.5, 0, 1.5, 3)]
-        if all(forest.off_camera(*s) > 2.2 and terrain.from_path(*s) > 1.2 and forest.free(*s, 0.5) for s in spots):
+        if all(
+            forest.off_camera(*s) > 2.2 and terrain.from_path(*s) > 1.2 and forest.free(*s, 0.5)
+            for s in spots
+        ):
             low, high = (terrain.height(*s) for s in (spots[0], spots[-1]))
             tilt = -math.atan2(high - low, 6.0)
             where = Vector((x, y, (low + high) / 2 - 0.06))
@@ -293,18 +366,38 @@ def plant_undergrowth(forest: Forest, palette: random.Random) -> None:
             if logs == 3:
                 break
 
-    def strew(count, kinds, near, far, path, camera, size, sink, spacing=0.0, cluster=-1.0, angle=0.75, sway=None, spread=9.0):
+    def strew(
+        count,
+        kinds,
+        near,
+        far,
+        path,
+        camera,
+        size,
+        sink,
+        spacing=0.0,
+        cluster=-1.0,
+        angle=0.75,
+        sway=None,
+        spread=9.0,
+    ):
         """Scatter `count` objects of `kinds` in the sector, off the path, the camera's track and trunks."""
         for _ in range(count):
             x, y = forest.polar(near, far, angle)
             scale = rng.uniform(*size)
-            if terrain.from_path(x, y) < path or forest.off_camera(x, y) < camera or not forest.free(x, y, spacing):
+            if (
+                terrain.from_path(x, y) < path
+                or forest.off_camera(x, y) < camera
+                or not forest.free(x, y, spacing)
+            ):
                 continue
             if terrain.pond and (Vector((x, y)) - terrain.pond[0]).length < terrain.pond[1] * 1.15:
                 continue
             if noise.noise((x * 0.28, y * 0.28, terrain.offset + cluster)) < cluster:
                 continue
-            ob = common.add(rng.choice(kinds), location=forest.at(x, y, sink * scale), rotation=spin(), scale=scale)
+            ob = common.add(
+                rng.choice(kinds), location=forest.at(x, y, sink * scale), rotation=spin(), scale=scale
+            )
             if sway and (Vector((x, y)) - shot.centre).length < spread:
                 forest.sway(ob, *sway)
 
@@ -340,13 +433,20 @@ def add_ground(forest: Forest) -> None:
             depth.append(0.32 + 0.68 * smooth(-0.1, 1.0, near))
     made.shades = [(tint, value, 0.0, 1.0) for tint, value in zip(tints, depth, strict=True)]
     row = cells + 1
-    made.faces = [(j * row + i, j * row + i + 1, (j + 1) * row + i + 1, (j + 1) * row + i) for j in range(cells) for i in range(cells)]
+    made.faces = [
+        (j * row + i, j * row + i + 1, (j + 1) * row + i + 1, (j + 1) * row + i)
+        for j in range(cells)
+        for i in range(cells)
+    ]
     made.slots, made.smooth = [0] * len(made.faces), [True] * len(made.faces)
     common.add(made.mesh("ground", [parts.ground_material()]))
     if terrain.pond is not None:
         centre, radius = terrain.pond
         water = common.material("water", (0.012, 0.020, 0.016), roughness=0.03)
-        rim = [(radius * 1.6 * math.cos(a), radius * 1.6 * math.sin(a), 0) for a in (math.tau * i / 48 for i in range(48))]
+        rim = [
+            (radius * 1.6 * math.cos(a), radius * 1.6 * math.sin(a), 0)
+            for a in (math.tau * i / 48 for i in range(48))
+        ]
         common.add(common.mesh("water", rim, [range(48)], water), location=(*centre, -0.22))
 
 
@@ -360,7 +460,10 @@ def add_lanterns(forest: Forest, palette: random.Random) -> None:
     placed = 0
     for _ in range(300):
         x, y = forest.polar(3.6, 5.2, 0.34) if placed == 0 else forest.polar(7.0, 12.0, 0.4)
-        if not 0.95 < terrain.from_path(x, y) < (3.0 if placed == 0 else 2.0) or forest.off_camera(x, y) < 1.6:
+        if (
+            not 0.95 < terrain.from_path(x, y) < (3.0 if placed == 0 else 2.0)
+            or forest.off_camera(x, y) < 1.6
+        ):
             continue
         if not forest.free(x, y, 0.25):
             continue
@@ -386,14 +489,26 @@ def add_flyers(forest: Forest, palette: random.Random) -> None:
     """Drifting leaves, birds that cross the view, butterflies over the path."""
     rng, shot, frames = forest.rng, forest.shot, forest.frames
     heading = shot.heading
-    ahead, right = Vector((math.cos(heading), math.sin(heading), 0)), Vector((math.sin(heading), -math.cos(heading), 0))
+    ahead, right = (
+        Vector((math.cos(heading), math.sin(heading), 0)),
+        Vector((math.sin(heading), -math.cos(heading), 0)),
+    )
     middle = common.curve_point(shot.points, 0.5)
     autumn = parts.leaf_material("autumn", [(0.45, 0.10, 0.02), (0.65, 0.27, 0.03), (0.70, 0.46, 0.06)])
     leaves = [parts.single_leaf(palette, autumn, size) for size in (0.13, 0.17)]
-    for _ in range(46):
-        far = rng.uniform(2.2, 9.0)
-        start = middle + ahead * far + right * (far * rng.uniform(-0.75, 0.75)) + Vector((0, 0, rng.uniform(-0.8, 2.2) * far / 5))
-        drift = right * rng.uniform(-0.02, 0.05) + ahead * rng.uniform(-0.02, 0.02) + Vector((0, 0, -rng.uniform(0.012, 0.032)))
+    for _ in range(26):
+        far = rng.uniform(2.6, 9.0)
+        start = (
+            middle
+            + ahead * far
+            + right * (far * rng.uniform(-0.75, 0.75))
+            + Vector((0, 0, rng.uniform(-0.8, 2.2) * far / 5))
+        )
+        drift = (
+            right * rng.uniform(-0.02, 0.05)
+            + ahead * rng.uniform(-0.02, 0.02)
+            + Vector((0, 0, -rng.uniform(0.012, 0.032)))
+        )
         spin = Vector([rng.uniform(-0.16, 0.16) for _ in range(3)])
         phase, first = rng.uniform(0, math.tau), [rng.uniform(0, math.tau) for _ in range(3)]
 
@@ -404,15 +519,21 @@ def add_flyers(forest: Forest, palette: random.Random) -> None:
 
         common.key_motion(common.add(rng.choice(leaves)), frames, fall)
 
-    feather = parts.leaf_material("jay", [(0.05, 0.14, 0.42), (0.10, 0.26, 0.62), (0.45, 0.55, 0.65), (0.03, 0.04, 0.07)], 0.5)
+    feather = parts.leaf_material(
+        "jay", [(0.05, 0.14, 0.42), (0.10, 0.26, 0.62), (0.45, 0.55, 0.65), (0.03, 0.04, 0.07)], 0.5
+    )
     beak = parts.plain_material("beak", (0.5, 0.3, 0.06))
     orange = parts.leaf_material("orange wings", [(0.75, 0.24, 0.02), (0.85, 0.42, 0.05), (0.06, 0.03, 0.02)])
     blue = parts.leaf_material("blue wings", [(0.12, 0.30, 0.75), (0.35, 0.55, 0.9), (0.05, 0.06, 0.12)])
     body = parts.bird_body(feather, beak)
-    flyers = [(body, parts.wing(feather, 0.42, 0.20, 0.25, "bird wing"), 0.85, 0.42, "bird") for _ in range(3)]
-    shape = common.tube_mesh("insect", [(0, -0.06, 0), (0, 0, 0), (0, 0.06, 0)], [0.008, 0.014, 0.008], beak, 6)
-    wings = [parts.wing(mat, 0.13, 0.16, -0.15, "butterfly wing") for mat in (orange, blue)]
-    flyers += [(shape, wings[i % 2], 1.0, 0.75, "butterfly") for i in range(5)]
+    flyers = [
+        (body, parts.wing(feather, 0.42, 0.20, 0.25, "bird wing"), 0.85, 0.42, "bird") for _ in range(2)
+    ]
+    shape = common.tube_mesh(
+        "insect", [(0, -0.06, 0), (0, 0, 0), (0, 0.06, 0)], [0.008, 0.014, 0.008], beak, 6
+    )
+    wings = [parts.wing(mat, 0.10, 0.13, -0.15, "butterfly wing") for mat in (orange, blue)]
+    flyers += [(shape, wings[i % 2], 1.0, 0.75, "butterfly") for i in range(4)]
     for data, wing, spread, pace, kind in flyers:
         bird = kind == "bird"
         far = rng.uniform(5.0, 8.5) if bird else rng.uniform(2.4, 4.6)
@@ -429,7 +550,9 @@ def add_flyers(forest: Forest, palette: random.Random) -> None:
             lift = (0.03 if bird else 0.07) * math.sin((pace if bird else 0.31) * f + phase)
             weave = 0.0 if bird else 0.5 * math.sin(0.2 * f + phase)
             aside = Vector((0, 0, lift)) + ahead * (0.0 if bird else 0.08 * math.sin(0.2 * f + phase))
-            return common.place(where + course * (f - frames / 2) + aside, (0.05 * math.sin(0.3 * f), 0.1 * math.sin(0.2 * f), yaw + weave))
+            pitch = 0.05 if bird else 0.75  # butterflies hang so that their wings are seen from the side
+            turn = (pitch + 0.05 * math.sin(0.3 * f), 0.1 * math.sin(0.2 * f), yaw + weave)
+            return common.place(where + course * (f - frames / 2) + aside, turn)
 
         common.key_motion(holder, frames, fly)
         for side in (-1, 1):
@@ -438,7 +561,11 @@ def add_flyers(forest: Forest, palette: random.Random) -> None:
             def flap(f: int, side=side, phase=phase, pace=pace, spread=spread) -> Matrix:
                 angle = 0.15 + spread * math.sin(pace * f + phase)
                 root = Vector((side * 0.02, 0.03, 0.03 if bird else 0.01))
-                return Matrix.Translation(root) @ Matrix.Rotation(-side * angle, 4, "Y") @ Matrix.Diagonal((side, 1, 1, 1))
+                return (
+                    Matrix.Translation(root)
+                    @ Matrix.Rotation(-side * angle, 4, "Y")
+                    @ Matrix.Diagonal((side, 1, 1, 1))
+                )
 
             rest = [flap(f) for f in range(frames + 2)]
             key_mirrored(ob, rest, side)
@@ -474,12 +601,25 @@ def build(*, seed: int, split: str, clip: int, frames: int) -> None:
     side = rng.choice((-1, 1))
     azimuth = shot.heading + side * math.radians(rng.uniform(85, 125))
     elevation = math.radians(rng.uniform(40, 50))
-    sun_from = Vector((math.cos(azimuth) * math.cos(elevation), math.sin(azimuth) * math.cos(elevation), math.sin(elevation)))
-    common.sun(-sun_from, (1.0, 0.80, 0.54), 7.0, 0.35)
+    sun_from = Vector(
+        (
+            math.cos(azimuth) * math.cos(elevation),
+            math.sin(azimuth) * math.cos(elevation),
+            math.sin(elevation),
+        )
+    )
+    common.sun(-sun_from, (1.0, 0.80, 0.54), 7.0, 0.12)
     common.sky(
-        [(-1.0, parts.HAZE), (0.0, (0.80, 0.86, 0.80)), (0.25, (0.62, 0.76, 0.85)), (0.7, (0.30, 0.50, 0.80))],
+        [
+            (-1.0, parts.HAZE),
+            (0.0, (0.80, 0.86, 0.80)),
+            (0.25, (0.62, 0.76, 0.85)),
+            (0.7, (0.30, 0.50, 0.80)),
+        ],
         light=(0.05, 0.065, 0.08),
     )
+    # Diffuse rays find the dim world by chance; every light sample goes to the sun.
+    bpy.context.scene.world.cycles.sampling_method = "NONE"
     add_lanterns(forest, palette)
     plant_trees(forest, sun_from, palette)
     plant_undergrowth(forest, palette)

@@ -16,7 +16,7 @@ from mathutils import Matrix, Vector, noise
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 import common
 
-HAZE = (0.50, 0.60, 0.60)
+HAZE = (0.44, 0.52, 0.51)
 SKY_LIGHT = (0.30, 0.40, 0.48)
 GROUND_LIGHT = (0.13, 0.12, 0.06)
 
@@ -31,9 +31,9 @@ def lit(nodes: common.Nodes, base: object, occlusion: object, normal: object = N
     ambient = nodes.mix(nodes.step(up, -1.0, 1.0), GROUND_LIGHT, SKY_LIGHT)
     ambient = nodes.mix(1.0, ambient, occlusion, "MULTIPLY")
     distance = nodes.node("ShaderNodeCameraData").outputs["View Distance"]
-    beyond = nodes.math("MAXIMUM", nodes.math("SUBTRACT", distance, 7.0), 0.0)
-    haze = nodes.math("SUBTRACT", 1.0, nodes.math("EXPONENT", nodes.math("MULTIPLY", beyond, -1 / 42)))
-    haze = nodes.math("MINIMUM", haze, 0.72)
+    beyond = nodes.math("MAXIMUM", nodes.math("SUBTRACT", distance, 9.0), 0.0)
+    haze = nodes.math("SUBTRACT", 1.0, nodes.math("EXPONENT", nodes.math("MULTIPLY", beyond, -1 / 58)))
+    haze = nodes.math("MINIMUM", haze, 0.66)
     nodes.set("Base Color", nodes.mix(haze, base, (0.02, 0.02, 0.02)))
     nodes.set("Emission Color", nodes.mix(haze, nodes.mix(1.0, base, ambient, "MULTIPLY"), HAZE))
     nodes.set("Emission Strength", 1.0)
@@ -57,7 +57,9 @@ def leaf_material(name: str, colors: list[common.Color], roughness: float = 0.5)
     """Leaves whose colour runs through `colors` by leaf and by plant."""
     mat, nodes = surface(name, roughness, 0.4)
     tint, occlusion = shade(nodes)
-    mixed = nodes.math("ADD", nodes.math("MULTIPLY", tint, 0.6), nodes.math("MULTIPLY", nodes.object_random(), 0.4))
+    mixed = nodes.math(
+        "ADD", nodes.math("MULTIPLY", tint, 0.6), nodes.math("MULTIPLY", nodes.object_random(), 0.4)
+    )
     stops = [(index / (len(colors) - 1), color) for index, color in enumerate(colors)]
     lit(nodes, nodes.ramp(mixed, stops), occlusion)
     return mat
@@ -70,13 +72,20 @@ def bark_material(name: str, dark: common.Color, light: common.Color, moss: floa
     place = nodes.coordinates()
     cracks = nodes.noise(nodes.mapping(place, (1, 1, 0.13)), 7.0 * grain, 2.0, 0.55)
     patches = nodes.noise(place, 1.1, 2.0)
-    base = nodes.ramp(cracks, [(0.34, dark), (0.5, tuple((a + b) / 2 for a, b in zip(dark, light, strict=True))), (0.68, light)])
+    base = nodes.ramp(
+        cracks,
+        [(0.34, dark), (0.5, tuple((a + b) / 2 for a, b in zip(dark, light, strict=True))), (0.68, light)],
+    )
     grey = nodes.step(patches, 0.5, 0.68, 0.0, 0.6)
     base = nodes.mix(grey, base, nodes.mix(0.5, base, (0.20, 0.18, 0.15)))
     base = nodes.mix(nodes.math("MULTIPLY", nodes.object_random(), 0.45), base, (0.20, 0.085, 0.04))
     green = nodes.ramp(nodes.noise(place, 9.0, 2.0), [(0.3, (0.035, 0.06, 0.010)), (0.7, (0.13, 0.19, 0.03))])
-    up = nodes.node("ShaderNodeSeparateXYZ", {0: nodes.node("ShaderNodeNewGeometry").outputs["Normal"]}).outputs["Z"]
-    grown = nodes.math("ADD", nodes.math("ADD", patches, nodes.math("MULTIPLY", up, 0.35)), nodes.math("MULTIPLY", tint, 0.5))
+    up = nodes.node(
+        "ShaderNodeSeparateXYZ", {0: nodes.node("ShaderNodeNewGeometry").outputs["Normal"]}
+    ).outputs["Z"]
+    grown = nodes.math(
+        "ADD", nodes.math("ADD", patches, nodes.math("MULTIPLY", up, 0.35)), nodes.math("MULTIPLY", tint, 0.5)
+    )
     base = nodes.mix(nodes.step(grown, 1.0 - moss, 1.14 - moss), base, green)
     nodes.set("Normal", nodes.bump(cracks, 0.12, 0.9))
     lit(nodes, base, occlusion)
@@ -89,12 +98,18 @@ def rock_material() -> bpy.types.Material:
     _, occlusion = shade(nodes)
     place = nodes.coordinates()
     rough = nodes.noise(place, 3.0, 3.0, 0.6)
-    base = nodes.ramp(rough, [(0.3, (0.05, 0.05, 0.05)), (0.55, (0.19, 0.18, 0.165)), (0.7, (0.34, 0.33, 0.30))])
+    base = nodes.ramp(
+        rough, [(0.3, (0.05, 0.05, 0.05)), (0.55, (0.19, 0.18, 0.165)), (0.7, (0.34, 0.33, 0.30))]
+    )
     cells = nodes.voronoi(place, 4.0)
     base = nodes.mix(nodes.step(cells, 0.16, 0.10, 0.0, 0.8), base, (0.36, 0.34, 0.20))
-    up = nodes.node("ShaderNodeSeparateXYZ", {0: nodes.node("ShaderNodeNewGeometry").outputs["Normal"]}).outputs["Z"]
+    up = nodes.node(
+        "ShaderNodeSeparateXYZ", {0: nodes.node("ShaderNodeNewGeometry").outputs["Normal"]}
+    ).outputs["Z"]
     moss = nodes.step(nodes.math("ADD", up, rough), 0.80, 1.10)
-    green = nodes.ramp(nodes.noise(place, 12.0, 1.0), [(0.35, (0.04, 0.065, 0.012)), (0.65, (0.15, 0.21, 0.03))])
+    green = nodes.ramp(
+        nodes.noise(place, 12.0, 1.0), [(0.35, (0.04, 0.065, 0.012)), (0.65, (0.15, 0.21, 0.03))]
+    )
     nodes.set("Normal", nodes.bump(rough, 0.15, 0.8))
     lit(nodes, nodes.mix(moss, base, green), occlusion)
     return mat
@@ -107,12 +122,18 @@ def ground_material() -> bpy.types.Material:
     place = nodes.world_position()
     litter = nodes.voronoi(place, 6.0, output="Color")
     litter = nodes.node("ShaderNodeSeparateColor", {0: litter}).outputs[0]
-    base = nodes.ramp(litter, [(0.0, (0.045, 0.022, 0.010)), (0.5, (0.115, 0.055, 0.022)), (1.0, (0.23, 0.125, 0.045))])
+    base = nodes.ramp(
+        litter, [(0.0, (0.045, 0.022, 0.010)), (0.5, (0.115, 0.055, 0.022)), (1.0, (0.23, 0.125, 0.045))]
+    )
     soil = nodes.noise(place, 2.2, 3.0, 0.6)
-    earth = nodes.ramp(soil, [(0.3, (0.10, 0.058, 0.032)), (0.5, (0.19, 0.115, 0.065)), (0.7, (0.30, 0.20, 0.12))])
+    earth = nodes.ramp(
+        soil, [(0.3, (0.10, 0.058, 0.032)), (0.5, (0.19, 0.115, 0.065)), (0.7, (0.30, 0.20, 0.12))]
+    )
     earth = nodes.mix(nodes.step(nodes.voronoi(place, 3.4), 0.20, 0.14, 0.0, 0.75), earth, (0.27, 0.25, 0.22))
     wide = nodes.noise(place, 0.55, 2.0)
-    moss = nodes.ramp(nodes.noise(place, 7.0, 1.0), [(0.35, (0.035, 0.06, 0.012)), (0.65, (0.12, 0.18, 0.03))])
+    moss = nodes.ramp(
+        nodes.noise(place, 7.0, 1.0), [(0.35, (0.035, 0.06, 0.012)), (0.65, (0.12, 0.18, 0.03))]
+    )
     base = nodes.mix(nodes.step(wide, 0.46, 0.60), base, moss)
     edge = nodes.math("ADD", path, nodes.math("MULTIPLY", nodes.math("SUBTRACT", soil, 0.5), 0.9))
     base = nodes.mix(nodes.step(edge, 0.35, 0.65), base, earth)
@@ -127,7 +148,9 @@ def plain_material(name: str, color: common.Color, roughness: float = 0.6, glow:
     if glow is not None:
         nodes.set("Base Color", color)
         nodes.set("Emission Color", glow)
-        nodes.set("Emission Strength", 1.0)
+        # A diffuse ray that hits the small lamp by chance would be a firefly: only the eye and the water see it.
+        rays = nodes.node("ShaderNodeLightPath").outputs
+        nodes.set("Emission Strength", nodes.math("MAXIMUM", rays["Is Camera Ray"], rays["Is Glossy Ray"]))
         return mat
     lit(nodes, color, (1.0, 1.0, 1.0))
     return mat
@@ -156,7 +179,9 @@ class Builder:
         self.slots += [slot] * len(faces)
         self.smooth += [smooth] * len(faces)
 
-    def leaf(self, at: Matrix, length: float, width: float, tint: float, occlusion: float, droop=0.15, slot=0):
+    def leaf(
+        self, at: Matrix, length: float, width: float, tint: float, occlusion: float, droop=0.15, slot=0
+    ):
         """A leaf along +y of `at`, folded at its midrib and drooping: six triangles."""
         half, fold = width / 2, width * 0.16
         points = [
@@ -220,7 +245,14 @@ def fern(rng, mat, stem, fronds=11, pairs=13, reach=0.85) -> bpy.types.Mesh:
             t = step / pairs
             rise = length * lift * (1.15 * t - 0.95 * t * t)
             spine.append(out * (length * (0.18 * t + 0.82 * t**1.4)) + Vector((0, 0, rise)))
-        made.tube(spine[::3] + [spine[-1]], [0.011 * (1 - 0.8 * i / (pairs // 3 + 1)) for i in range(len(spine[::3]) + 1)], 4, 0.2, 0.6, 1)
+        made.tube(
+            spine[::3] + [spine[-1]],
+            [0.011 * (1 - 0.8 * i / (pairs // 3 + 1)) for i in range(len(spine[::3]) + 1)],
+            4,
+            0.2,
+            0.6,
+            1,
+        )
         tint = rng.random()
         for step in range(2, pairs + 1):
             t = step / pairs
@@ -283,13 +315,19 @@ def bush(rng, mat, stem, height=1.8, stems=5, leaf=0.14, leaves=22) -> bpy.types
             t = rng.uniform(0.3, 1.0)
             root = common.curve_point(points, t)
             angle = rng.uniform(0, math.tau)
-            reach = Vector((math.cos(angle), math.sin(angle), rng.uniform(-0.1, 0.35))) * rng.uniform(0.08, 0.4)
+            reach = Vector((math.cos(angle), math.sin(angle), rng.uniform(-0.1, 0.35))) * rng.uniform(
+                0.08, 0.4
+            )
             made.tube([root, root + reach], [0.006, 0.004], 3, 0.1, 0.6, 1)
             at = aim(root + reach, (math.cos(angle), math.sin(angle), rng.uniform(-0.45, 0.1)))
             size = leaf * rng.uniform(0.75, 1.25)
             made.leaf(at, size, size * 0.85, rng.random(), 0.45 + 0.55 * t, 0.25)
-            made.leaf(at @ Matrix.Rotation(0.9, 4, "Z"), size * 0.8, size * 0.6, rng.random(), 0.45 + 0.55 * t, 0.3)
-            made.leaf(at @ Matrix.Rotation(-0.9, 4, "Z"), size * 0.8, size * 0.6, rng.random(), 0.45 + 0.55 * t, 0.3)
+            made.leaf(
+                at @ Matrix.Rotation(0.9, 4, "Z"), size * 0.8, size * 0.6, rng.random(), 0.45 + 0.55 * t, 0.3
+            )
+            made.leaf(
+                at @ Matrix.Rotation(-0.9, 4, "Z"), size * 0.8, size * 0.6, rng.random(), 0.45 + 0.55 * t, 0.3
+            )
     return made.mesh("bush", [mat, stem])
 
 
@@ -303,14 +341,18 @@ def branch(rng, mat, stem, length=4.2, sprays=46, size=0.6) -> bpy.types.Mesh:
         root = common.curve_point(points, t)
         sign = -1 if number % 2 else 1
         far = (0.35 + 0.9 * math.sin(math.pi * min(1.0, 0.15 + 0.85 * t))) * rng.uniform(0.5, 1.1)
-        forward = Vector((sign * rng.uniform(0.7, 1.1), rng.uniform(0.3, 0.9), rng.uniform(-0.35, 0.1))).normalized()
+        forward = Vector(
+            (sign * rng.uniform(0.7, 1.1), rng.uniform(0.3, 0.9), rng.uniform(-0.35, 0.1))
+        ).normalized()
         tip = root + forward * far
         made.tube([root, tip], [0.018, 0.008], 3, 0.0, 0.7, 1)
         for part in range(3):
             base = root.lerp(tip, 0.3 + 0.35 * part)
             for swing in (-0.6, 0.6) if part < 2 else (-0.45, 0.0, 0.45):
                 at = aim(base, forward + Vector((0, 0, -0.25))) @ Matrix.Rotation(swing, 4, "Z")
-                made.leaf(at, size * rng.uniform(0.7, 1.1), size * 0.30, rng.random(), 0.5 + 0.5 * rng.random(), 0.3)
+                made.leaf(
+                    at, size * rng.uniform(0.7, 1.1), size * 0.30, rng.random(), 0.5 + 0.5 * rng.random(), 0.3
+                )
     return made.mesh("branch", [mat, stem])
 
 
@@ -319,8 +361,12 @@ def clump(rng, mat, leaves=60, leaf=0.9) -> bpy.types.Mesh:
     made = Builder()
     for _ in range(leaves):
         way = Vector((rng.gauss(0, 1), rng.gauss(0, 1), rng.gauss(0, 0.7))).normalized()
-        at = aim(way * 2.5 * rng.random() ** 0.4, (way.x + rng.gauss(0, 0.5), way.y + rng.gauss(0, 0.5), -0.5))
-        made.leaf(at, leaf * rng.uniform(0.6, 1.3), leaf * 0.6, rng.random(), 0.55 + 0.45 * max(0.0, way.z), 0.3)
+        at = aim(
+            way * 2.5 * rng.random() ** 0.4, (way.x + rng.gauss(0, 0.5), way.y + rng.gauss(0, 0.5), -0.5)
+        )
+        made.leaf(
+            at, leaf * rng.uniform(0.6, 1.3), leaf * 0.6, rng.random(), 0.55 + 0.45 * max(0.0, way.z), 0.3
+        )
     return made.mesh("clump", [mat])
 
 
@@ -333,7 +379,9 @@ def trunk(rng, mat, radius=0.8, height=26.0, sides=56, rings=46) -> bpy.types.Me
     for ring in range(rings):
         t = ring / (rings - 1)
         z = -0.6 + (height + 0.6) * t**1.7
-        width = radius * (1 - 0.55 * max(0.0, z) / height) + radius * 0.75 * math.exp(-max(0.0, z + 0.3) / (radius * 0.9))
+        width = radius * (1 - 0.55 * max(0.0, z) / height) + radius * 0.75 * math.exp(
+            -max(0.0, z + 0.3) / (radius * 0.9)
+        )
         lean = Vector((noise.noise((seed, 0, z * 0.05)), noise.noise((0, seed, z * 0.05)), 0)) * 0.5
         for side in range(sides):
             angle = math.tau * side / sides
@@ -357,7 +405,13 @@ def trunk(rng, mat, radius=0.8, height=26.0, sides=56, rings=46) -> bpy.types.Me
         out = Vector((math.cos(angle), math.sin(angle), rng.uniform(-0.2, 0.5)))
         foot = Vector((out.x, out.y, 0)) * radius * 0.6 + Vector((0, 0, z))
         long = rng.uniform(0.5, 1.4)
-        made.tube([foot, foot + out * (radius * 0.3 + long * 0.5), foot + out * (radius * 0.3 + long)], [0.07, 0.05, 0.015], 5, 0.0, 0.8)
+        made.tube(
+            [foot, foot + out * (radius * 0.3 + long * 0.5), foot + out * (radius * 0.3 + long)],
+            [0.07, 0.05, 0.015],
+            5,
+            0.0,
+            0.8,
+        )
     return made.mesh("trunk", [mat])
 
 
@@ -389,10 +443,17 @@ def log(rng, mat, wood, cap, length=6.0, radius=0.42) -> bpy.types.Mesh:
         size, high = rng.uniform(0.07, 0.15), rng.uniform(0.5, 1.1) * radius
         centre = Vector((x, sign * radius * 0.86, high))
         fan = [centre] + [
-            centre + Vector((math.cos(a) * size, sign * math.sin(a) * size * 1.3, 0.02)) for a in [math.pi * i / 8 for i in range(9)]
+            centre + Vector((math.cos(a) * size, sign * math.sin(a) * size * 1.3, 0.02))
+            for a in [math.pi * i / 8 for i in range(9)]
         ]
         below = [point - Vector((0, 0, 0.05)) for point in fan[:1]]
-        made.add(fan + below, [(0, i, i + 1) for i in range(1, 9)] + [(10, i + 1, i) for i in range(1, 9)], rng.random(), 1.0, 2)
+        made.add(
+            fan + below,
+            [(0, i, i + 1) for i in range(1, 9)] + [(10, i + 1, i) for i in range(1, 9)],
+            rng.random(),
+            1.0,
+            2,
+        )
     return made.mesh("log", [mat, wood, cap])
 
 
@@ -406,12 +467,23 @@ def rock(rng, mat) -> bpy.types.Mesh:
     vertices, depth = [], []
     for vertex in shape.verts:
         p = vertex.co
-        size = 1 + 0.38 * noise.noise(p * 0.9 + Vector((seed, 0, 0))) + 0.13 * noise.noise(p * 2.6 + Vector((0, seed, 0)))
+        size = (
+            1
+            + 0.38 * noise.noise(p * 0.9 + Vector((seed, 0, 0)))
+            + 0.13 * noise.noise(p * 2.6 + Vector((0, seed, 0)))
+        )
         # Facets: pull the surface towards a few planes.
         chip = noise.cell_vector(p * 1.3 + Vector((seed, seed, 0))).x
         vertices.append(Vector((p.x * 1.15, p.y, p.z * 0.72)) * (size + 0.05 * chip))
         depth.append(0.35 + 0.65 * min(1.0, max(0.0, p.z + 0.55)))
-    made.add(vertices, [[vertex.index for vertex in face.verts] for face in shape.faces], 0.5, depth, 0, smooth=True)
+    made.add(
+        vertices,
+        [[vertex.index for vertex in face.verts] for face in shape.faces],
+        0.5,
+        depth,
+        0,
+        smooth=True,
+    )
     shape.free()
     return made.mesh("rock", [mat])
 
@@ -422,7 +494,10 @@ def litter(rng, mat, leaves=34, spread=0.8) -> bpy.types.Mesh:
     for _ in range(leaves):
         far, turn = spread * math.sqrt(rng.random()), rng.uniform(0, math.tau)
         angle, size = rng.uniform(0, math.tau), rng.uniform(0.08, 0.14)
-        at = aim((far * math.cos(turn), far * math.sin(turn), rng.uniform(0.015, 0.04)), (math.cos(angle), math.sin(angle), rng.uniform(0.0, 0.35)))
+        at = aim(
+            (far * math.cos(turn), far * math.sin(turn), rng.uniform(0.015, 0.04)),
+            (math.cos(angle), math.sin(angle), rng.uniform(0.0, 0.35)),
+        )
         made.leaf(at, size, size * 0.6, rng.random(), rng.uniform(0.6, 1.0), 0.2)
     return made.mesh("litter", [mat])
 
@@ -443,7 +518,9 @@ def wing(mat, length: float, width: float, sweep: float, name: str) -> bpy.types
     """A right wing along +x with a scalloped edge; mirror it by a scale of -1 in x."""
     made = Builder()
     lead = [Vector((length * t, width * (0.45 - sweep * t * t), 0)) for t in (0, 0.35, 0.7, 1.0)]
-    trail = [Vector((length * t, -width * (0.55 - 0.35 * t * t + sweep * t), 0)) for t in (0, 0.35, 0.7, 0.97)]
+    trail = [
+        Vector((length * t, -width * (0.55 - 0.35 * t * t + sweep * t), 0)) for t in (0, 0.35, 0.7, 0.97)
+    ]
     faces = [(i, i + 4, i + 5, i + 1) for i in range(3)]
     for index, face in enumerate(faces):
         made.add([(lead + trail)[i] for i in face], [(0, 1, 2, 3)], 0.1 + 0.4 * index, 1.0)
@@ -453,11 +530,25 @@ def wing(mat, length: float, width: float, sweep: float, name: str) -> bpy.types
 def bird_body(mat, beak, length=0.42) -> bpy.types.Mesh:
     """A bird's body along +y with head, beak and tail."""
     made = Builder()
-    profile = [(-0.5, 0.02), (-0.32, 0.10), (-0.05, 0.17), (0.18, 0.14), (0.29, 0.105), (0.40, 0.115), (0.5, 0.05)]
+    profile = [
+        (-0.5, 0.02),
+        (-0.32, 0.10),
+        (-0.05, 0.17),
+        (0.18, 0.14),
+        (0.29, 0.105),
+        (0.40, 0.115),
+        (0.5, 0.05),
+    ]
     made.tube([(0, length * y, 0) for y, _ in profile], [length * r for _, r in profile], 10, 0.3, 1.0)
-    tip = [Vector((x, length * y, z)) for x, y, z in ((0.02, 0.48, 0.01), (-0.02, 0.48, 0.01), (0, 0.48, -0.02), (0, 0.64, 0))]
+    tip = [
+        Vector((x, length * y, z))
+        for x, y, z in ((0.02, 0.48, 0.01), (-0.02, 0.48, 0.01), (0, 0.48, -0.02), (0, 0.64, 0))
+    ]
     made.add(tip, [(0, 1, 3), (1, 2, 3), (2, 0, 3)], 0.5, 1.0, 1)
-    tail = [Vector((x * length, y * length, 0.0)) for x, y in ((-0.05, -0.35), (0.05, -0.35), (0.16, -0.95), (0, -0.88), (-0.16, -0.95))]
+    tail = [
+        Vector((x * length, y * length, 0.0))
+        for x, y in ((-0.05, -0.35), (0.05, -0.35), (0.16, -0.95), (0, -0.88), (-0.16, -0.95))
+    ]
     made.add(tail, [(0, 1, 2, 3), (0, 3, 4)], 0.9, 1.0)
     return made.mesh("bird", [mat, beak])
 
