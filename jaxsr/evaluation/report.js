@@ -5,6 +5,7 @@
   const data = JSON.parse(document.getElementById("data").textContent);
   const $ = (id) => document.getElementById(id);
   const escape = (s) => String(s).replace(/[&<>"]/g, (c) => ({ "&": "&amp;", "<": "&lt;", ">": "&gt;", '"': "&quot;" })[c]);
+  const n = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
   const clamp = (x, low, high) => Math.min(Math.max(x, low), high);
   const stage = $("stage"), canvas = $("canvas"), handle = $("handle"), tip = $("tip");
 
@@ -12,8 +13,8 @@
     ["flip", "FLIP", "FLIP error map against the truth"], ["diff", "Left − right", "|difference| between left and right, mean of R, G, B"]];
   const SCALES = [0.02, 0.05, 0.1, 0.2, 0.5, 1];
   const ZOOMS = [1, 2, 3, 4, 6, 8];
-  const FPS = [1, 2, 4, 8, 12, 24, 30, 60];
-  const state = { section: 0, frame: 0, left: "", right: "", view: "image", scale: 0.2, zoom: 0, x: 0.5, y: 0.5, split: 0.5, subset: "", fps: 4 };
+  const FPS = [...new Set([1, 2, 4, 8, 12, 24, 30, 60, data.fps])].sort((a, b) => a - b);
+  const state = { section: 0, frame: 0, left: "", right: "", view: "image", scale: 0.2, zoom: 0, x: 0.5, y: 0.5, split: 0.5, subset: "", fps: data.fps };
   let playing = 0, pointer = null, queued = false, hover = null;
 
   // Sources: what can be put on a side. Every section has the truth, perhaps the input, and its tracks.
@@ -26,6 +27,7 @@
   const section = () => data.sections[state.section];
   const source = (key) => section().sources.find((s) => s.key === key);
   const frames = () => section().frames.length;
+  document.documentElement.classList.add("js");
 
   // ---- images: decoded when first needed, pixels and maps kept in small caches
   const pictures = new Map(), pixelCache = new Map(), mapCache = new Map();
@@ -42,8 +44,9 @@
     if (!entry) {
       entry = { image: new Image(), ready: false, broken: false };
       pictures.set(index, entry);
+      entry.image.onload = () => { entry.ready = true; draw(); };
+      entry.image.onerror = () => { entry.broken = true; draw(); };
       entry.image.src = data.images[index];
-      entry.image.decode().then(() => { entry.ready = true; draw(); }, () => { entry.broken = true; draw(); });
     }
     return entry;
   }
@@ -87,6 +90,7 @@
   // What to draw for a source in the current view: {image} or {text}.
   function shown(src) {
     const f = state.frame, index = src.images[f], truth = section().truth[f];
+    if (!section().embedded[f]) return { text: "this frame's images are not in the page" };
     if (index == null) return { text: "not rendered: this frame is extrapolated" };
     const wait = (x) => (x ? { image: x } : { text: "" });
     if (state.view === "error") return wait(difference(index, truth));
@@ -214,9 +218,16 @@
     for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) out.push(v);
     return [out, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))];
   }
-  const CHART = { left: 44, right: 8, top: 8, bottom: 17, height: 112 };
+  const CHART = { left: 44, right: 8, top: 8, bottom: 17, height: 130 };
+  // As many charts in a row as there are metrics, if each gets 250 pixels.
+  function chartWidth() {
+    const room = $("charts").clientWidth || 350, s = section(), count = Object.keys(data.metrics).filter((k) => s.tracks.some((t) => t.metrics[k])).length || 1;
+    const fit = clamp(Math.floor((room + 24) / 274), 1, count), columns = count === 4 && fit === 3 ? 2 : fit;
+    $("charts").style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
+    return (room - 24 * (columns - 1)) / columns;
+  }
   function charts() {
-    const s = section(), n = frames(), box = $("charts"), width = Math.max(200, box.clientWidth || 350);
+    const s = section(), n = frames(), box = $("charts"), width = chartWidth();
     const xOf = (i) => CHART.left + ((i + 0.5) * (width - CHART.left - CHART.right)) / n;
     const half = (width - CHART.left - CHART.right) / n / 2;
     let html = "";
@@ -250,8 +261,8 @@
       html += `<div class="chart" data-key="${key}"><header><b>${escape(m.label)}${m.unit ? ` [${escape(m.unit)}]` : ""}</b><span>${m.higher_is_better ? "higher" : "lower"} is better</span></header>
         <svg viewBox="0 0 ${width} ${CHART.height}" preserveAspectRatio="none" role="img" aria-label="${escape(m.label)} of every frame; the numbers are in the table below">${svg}</svg></div>`;
     }
-    if (s.extrapolated.some(Boolean)) html += `<div class="key"><i></i>extrapolated frames</div>`;
     box.innerHTML = html;
+    $("charts-key").hidden = !s.extrapolated.some(Boolean);
     const frameAt = (e, svg) => { const r = svg.getBoundingClientRect(); return clamp(Math.floor(((e.clientX - r.left) * (width / r.width) - CHART.left) / (2 * half)), 0, n - 1); };
     for (const chart of box.querySelectorAll(".chart")) {
       const svg = chart.querySelector("svg");
@@ -262,7 +273,7 @@
     chartState();
   }
   function chartState() {
-    const width = Math.max(200, $("charts").clientWidth || 350), n = frames();
+    const width = chartWidth(), n = frames();
     const x = (i) => CHART.left + ((i + 0.5) * (width - CHART.left - CHART.right)) / n;
     for (const line of document.querySelectorAll(".chart .now")) { line.setAttribute("x1", x(state.frame)); line.setAttribute("x2", x(state.frame)); }
     for (const line of document.querySelectorAll(".chart .hover")) {
@@ -308,10 +319,11 @@
     $("sections").hidden = data.sections.length < 2;
     buttons($("views"), VIEWS.filter(([v]) => v !== "flip" || s.hasFlip), state.view, (v) => { state.view = v; update(); });
     $("scrub").max = frames() - 1;
-    $("ticks").innerHTML = s.extrapolated.map((x) => `<i class="${x ? "x" : ""}"></i>`).join("");
-    $("sources").innerHTML = `<thead><tr><th scope="col">Compare</th><th scope="col">Left</th><th scope="col">Right</th></tr></thead><tbody>` + s.sources.map((t) =>
-      `<tr><td><span class="swatch ${t.metrics ? "" : "none"}" style="--c:${t.color}"></span>${escape(t.name)}${t.note ? `<small>${escape(t.note)}</small>` : ""}</td>` +
-      ["left", "right"].map((side) => `<td><input type="radio" name="${side}" value="${escape(t.key)}" aria-label="${escape(t.name)} on the ${side}"></td>`).join("") + "</tr>").join("") + "</tbody>";
+    $("ticks").innerHTML = s.extrapolated.map((x, i) => `<i class="${x ? "x" : ""}${s.embedded[i] ? "" : " empty"}"></i>`).join("");
+    s.columns = ["psnr", "flip"].filter((k) => s.tracks.some((t) => t.metrics[k]));
+    $("sources").innerHTML = `<thead><tr><th scope="col">Compare</th><th scope="col">Left</th><th scope="col">Right</th>${s.columns.map((k) => `<th scope="col" class="n">${escape(data.metrics[k].label)}</th>`).join("")}</tr></thead><tbody>` + s.sources.map((t) =>
+      `<tr data-key="${escape(t.key)}"><td><div><span class="swatch ${t.metrics ? "" : "none"}" style="--c:${t.color}"></span><span>${escape(t.name)}${t.note ? `<small>${escape(t.note)}</small>` : ""}</span></div></td>` +
+      ["left", "right"].map((side) => `<td><input type="radio" name="${side}" value="${escape(t.key)}" aria-label="${escape(t.name)} on the ${side}"></td>`).join("") + s.columns.map(() => '<td class="n"></td>').join("") + "</tr>").join("") + "</tbody>";
     for (const el of document.querySelectorAll(".result")) {
       el.querySelectorAll("tbody tr").forEach((row, i) => {
         if (!row.querySelector(".swatch")) row.firstElementChild.insertAdjacentHTML("afterbegin", `<span class="swatch" style="--c:var(--t${i % 10})"></span>`);
@@ -321,7 +333,8 @@
     if (!s.subsets.some(([name]) => name === state.subset)) state.subset = s.subsets[0][0];
     buttons($("subsets"), subsets, state.subset, (v) => { state.subset = v; update(); });
     $("subsets").hidden = subsets.length < 2;
-    $("results-title").textContent = s.title;
+    $("results-title").textContent = "Results";
+    $("results-facts").textContent = `${s.title} · ${n(frames(), "frame")} of ${s.size[0]}×${s.size[1]}`;
     $("numbers").hidden = false;
     numbers(); charts(); update();
     for (const src of s.sources) for (const index of src.images) if (index != null) picture(index);
@@ -332,6 +345,11 @@
     chip($("chip-right"), src.right);
     $("chip-right").hidden = state.view === "diff";
     for (const side of ["left", "right"]) for (const input of document.querySelectorAll(`input[name="${side}"]`)) input.checked = input.value === state[side];
+    for (const row of $("sources").querySelectorAll("tbody tr")) {
+      const t = source(row.dataset.key);
+      row.querySelectorAll("td.n").forEach((td, i) => { td.textContent = t.metrics?.[s.columns[i]] ? show(t.metrics[s.columns[i]][state.frame], s.columns[i]) : ""; });
+    }
+    $("sources-frame").textContent = `PSNR and FLIP of frame ${s.frames[state.frame]}`;
     mark($("views"), state.view); mark($("subsets"), state.subset); mark($("zooms"), state.zoom);
     $("scale-box").hidden = state.view === "image"; $("legend").hidden = state.view === "image";
     $("scale").value = state.scale; $("fps").value = state.fps;
@@ -361,7 +379,8 @@
   function defaults() {
     const s = section(), n = frames(), middle = Math.floor(n / 2);
     state.left = s.tracks[0].key; state.right = s.tracks.length > 1 ? s.tracks[s.tracks.length - 1].key : "truth";
-    state.frame = s.extrapolated[middle] || !s.extrapolated[middle - 1] ? middle : middle - 1;
+    const shown = s.frames.map((_, i) => i).filter((i) => s.embedded[i]).sort((a, b) => Math.abs(a - middle) - Math.abs(b - middle));
+    state.frame = shown.find((i) => s.extrapolated[i]) ?? shown[0];
     state.subset = s.subsets[0][0];
   }
   function enter(index) {
@@ -390,14 +409,19 @@
 
   // ---- control
   function go(frame) { state.frame = (frame + frames()) % frames(); update(); }
+  function step(direction) { // to the next frame that has images
+    let f = state.frame;
+    do f = (f + direction + frames()) % frames(); while (!section().embedded[f] && f !== state.frame);
+    go(f);
+  }
   function play(on) {
     clearInterval(playing);
-    playing = on ? setInterval(() => go(state.frame + 1), 1000 / state.fps) : 0;
+    playing = on ? setInterval(() => step(1), 1000 / state.fps) : 0;
     update();
   }
   function swap() { [state.left, state.right] = [state.right, state.left]; update(); }
-  $("previous").onclick = () => go(state.frame - 1);
-  $("next").onclick = () => go(state.frame + 1);
+  $("previous").onclick = () => step(-1);
+  $("next").onclick = () => step(1);
   $("play").onclick = () => play(!playing);
   $("scrub").oninput = (e) => go(+e.target.value);
   $("scale").innerHTML = SCALES.map((v) => `<option value="${v}">${v}</option>`).join("");
@@ -455,7 +479,7 @@
     if (e.key === " " && (tag === "BUTTON" || tag === "SUMMARY" || (tag === "INPUT" && e.target.type === "radio"))) return;
     const views = VIEWS.map(([v]) => v).filter((v) => v !== "flip" || section().hasFlip);
     const act = {
-      ArrowLeft: () => go(state.frame - 1), ArrowRight: () => go(state.frame + 1), " ": () => play(!playing), x: swap,
+      ArrowLeft: () => step(-1), ArrowRight: () => step(1), " ": () => play(!playing), x: swap,
       Home: () => go(0), End: () => go(frames() - 1), "+": () => stepZoom(1), "-": () => stepZoom(-1),
       v: () => { state.view = views[(views.indexOf(state.view) + 1) % views.length]; update(); },
       "[": () => { state.split = clamp(state.split - 0.02, 0, 1); update(); }, "]": () => { state.split = clamp(state.split + 0.02, 0, 1); update(); },
@@ -463,10 +487,10 @@
     if (act) { e.preventDefault(); act(); }
   });
   addEventListener("hashchange", readHash);
-  new ResizeObserver(() => { charts(); draw(); }).observe($("viewer"));
+  new ResizeObserver(() => { charts(); draw(); }).observe(document.querySelector("main"));
 
   const bar = $("legend-bar").getContext("2d");
   for (let i = 0; i < 256; i++) { bar.fillStyle = `rgb(${LUT.slice(3 * i, 3 * i + 3)})`; bar.fillRect(i, 0, 1, 1); }
-  $("viewer").hidden = false; $("side").hidden = false;
+  $("viewer").hidden = false; $("side").hidden = false; $("curves").hidden = false;
   readHash();
 })();

@@ -1,132 +1,33 @@
 """The comparison page: one HTML file with everything in it, which opens from disk and asks for nothing else.
 
-Images are embedded at the best quality that keeps the page below a size: lossless WebP, then lossless WebP
-of values rounded to 7 or 6 bits, then JPEG without chroma subsampling. The page says which, and how large
-the error of the encoding is. Metrics on the page were measured before encoding; error maps are computed in
-the browser from the embedded images.
+Images are embedded at the best quality that keeps the page below a size (`embedding.py`), and the page says
+which that is and how large the error of the encoding is. Metrics on the page were measured before encoding;
+error maps are computed in the browser from the embedded images.
 
 The numbers of a section are also in plain HTML tables, readable without JavaScript.
 """
 
 import base64
-import hashlib
 import html
-import io
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from matplotlib import colormaps
-from PIL import Image
 
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.tables import ImageOrPath, Section, json_value, rows, write_text
+from jaxsr.evaluation.embedding import Images, thinned
+from jaxsr.evaluation.tables import Section, json_value, rows
+from jaxsr.io.exr import atomic_path
 from jaxsr.metrics import METRICS
 
 MAX_MEGABYTES = 18.0
 """Default aim for the size of the page."""
-
-
-def to_bytes(image: ImageOrPath, where: str = "image") -> np.ndarray:
-    """A display-referred image [H, W, 3] in [0, 1], or the file that holds one, as uint8 [H, W, 3].
-
-    Raises:
-        JaxsrError: unreadable file, wrong shape, NaN, values outside [0, 1].
-    """
-    if isinstance(image, Path):
-        try:
-            with Image.open(image) as file:
-                return np.asarray(file.convert("RGB"))
-        except (OSError, SyntaxError) as error:
-            raise JaxsrError("cannot read the image", where=image, found=error) from error
-    array = np.asarray(image)
-    if array.ndim != 3 or array.shape[-1] != 3:
-        raise JaxsrError("not an RGB image", where=where, expected="[H, W, 3]", found=array.shape)
-    if array.dtype == np.uint8:
-        return array
-    array = array.astype(np.float32)
-    if not (float(array.min()) >= 0.0 and float(array.max()) <= 1.0):  # false for NaN too
-        raise JaxsrError(
-            "image is not display-referred",
-            where=where,
-            expected="values in [0, 1]",
-            found=f"[{array.min():.4g}, {array.max():.4g}]",
-        )
-    return np.rint(array * 255.0).astype(np.uint8)
-
-
-def _save(array: np.ndarray, **options: Any) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(array).save(buffer, **options)
-    return buffer.getvalue()
-
-
-def _lossless(step: int) -> Callable[[np.ndarray], bytes]:
-    def encode(image: np.ndarray) -> bytes:
-        kept = (
-            np.minimum(np.rint(image / np.float32(step)) * step, 255).astype(np.uint8) if step > 1 else image
-        )
-        return _save(kept, format="WEBP", lossless=True, method=2, quality=50, exact=True)
-
-    return encode
-
-
-def _jpeg(quality: int) -> Callable[[np.ndarray], bytes]:
-    return lambda image: _save(image, format="JPEG", quality=quality, subsampling=0, optimize=True)
-
-
-ENCODINGS: dict[str, tuple[str, Callable[[np.ndarray], bytes]]] = {
-    "WebP, lossless (8 bits a channel)": ("webp", _lossless(1)),
-    "WebP, lossless after rounding to 7 bits a channel": ("webp", _lossless(2)),
-    "WebP, lossless after rounding to 6 bits a channel": ("webp", _lossless(4)),
-    **{f"JPEG, quality {q}, 4:4:4": ("jpeg", _jpeg(q)) for q in (98, 95, 91, 85, 75)},
-}
-"""From best to smallest: name -> (image subtype, encoder of uint8 [H, W, 3])."""
-
-
-def _flip_bytes(error: np.ndarray) -> bytes:
-    """A FLIP map, uint8 [H, W], as a small grey JPEG; it is looked at, never measured."""
-    return _save(error, format="JPEG", quality=70, optimize=True)
-
-
-def _choose(images: Sequence[np.ndarray], budget: float) -> str:
-    """The best encoding that is expected to stay within `budget` bytes of base64, from every n-th image."""
-    sample = images[:: math.ceil(len(images) / 10)]
-    area = sum(i.size for i in images) / sum(i.size for i in sample)
-    for name, (_, encode) in ENCODINGS.items():
-        if sum(len(encode(i)) for i in sample) * area * 4 / 3 <= budget:
-            return name
-    return name
-
-
-class _Images:
-    """Images of the page, each once: the truth is shared by tasks, inputs by methods."""
-
-    def __init__(self) -> None:
-        self.arrays: list[np.ndarray] = []
-        self.flips: list[np.ndarray] = []
-        self._index: dict[tuple[tuple[int, ...], bytes], int] = {}
-
-    def add(self, image: ImageOrPath | None, where: str) -> int | None:
-        if image is None:
-            return None
-        array = to_bytes(image, where)
-        key = (array.shape, hashlib.sha256(array.tobytes()).digest())
-        if key not in self._index:
-            self._index[key] = len(self.arrays)
-            self.arrays.append(array)
-        return self._index[key]
-
-    def add_flip(self, error: np.ndarray) -> int:
-        """FLIP maps are numbered from -1 downwards until the number of images is known."""
-        self.flips.append(error)
-        return -len(self.flips)
 
 
 def _keys(names: Iterable[str]) -> list[str]:
@@ -141,14 +42,14 @@ def _keys(names: Iterable[str]) -> list[str]:
     return keys
 
 
-def _section_data(section: Section, images: _Images) -> dict[str, Any]:
+def _section_data(section: Section, images: Images) -> dict[str, Any]:
     """What the viewer needs of one section."""
 
     def place(what: str, i: int) -> str:
         return f"{section.title}, {what}, frame {section.frames[i]}"
 
     truth = [images.add(image, place("truth", i)) for i, image in enumerate(section.truths)]
-    shapes = {images.arrays[i].shape for i in truth if i is not None}
+    shapes = {images.shapes[i] for i in truth}
     if len(shapes) != 1:
         raise JaxsrError("truth frames differ in size", where=section.title, found=sorted(shapes))
     (shape,) = shapes
@@ -156,22 +57,24 @@ def _section_data(section: Section, images: _Images) -> dict[str, Any]:
     for key, track in zip(_keys(t.name for t in section.tracks), section.tracks, strict=True):
         indices = [images.add(image, place(track.name, i)) for i, image in enumerate(track.images)]
         for i, index in enumerate(indices):
-            if index is None or images.arrays[index].shape != shape:
-                found = None if index is None else images.arrays[index].shape
+            if images.shapes[index] != shape:
+                found = images.shapes[index]
                 raise JaxsrError("wrong size", where=place(track.name, i), expected=shape, found=found)
-        flip = [images.add_flip(error) for error in track.flip_maps] or None
         tracks.append(
             {
                 "key": key,
                 "name": track.name,
                 "note": track.note,
                 "images": indices,
-                "flip": flip,
+                "flip": list(track.flip_maps),
                 "metrics": track.metrics,
             }
         )
-    inputs = [images.add(image, place("input", i)) for i, image in enumerate(section.inputs)] or None
-    sizes = {images.arrays[i].shape for i in inputs or [] if i is not None}
+    inputs = [
+        None if image is None else images.add(image, place("input", i))
+        for i, image in enumerate(section.inputs)
+    ]
+    sizes = {images.shapes[i] for i in inputs if i is not None}
     if len(sizes) > 1:
         raise JaxsrError("input frames differ in size", where=section.title, found=sorted(sizes))
     note = "".join(f"{w}×{h}, pixels enlarged" for h, w, _ in sizes if (h, w, 3) != shape)
@@ -235,29 +138,46 @@ def _flat(meta: Mapping[str, Any], prefix: str = "") -> list[tuple[str, object]]
     return out
 
 
-def _encode(images: _Images, budget: float) -> tuple[list[str], str]:
-    """Data URIs of all images and then all FLIP maps, and a sentence about the encoding."""
-    with ThreadPoolExecutor(4) as pool:
-        flips = list(pool.map(_flip_bytes, images.flips))
-        name = _choose(images.arrays, budget - sum(map(len, flips)) * 4 / 3)
-        subtype, encode = ENCODINGS[name]
-        files = list(pool.map(encode, images.arrays))
-    worst, squares, count = 0, 0.0, 0
-    for array, file in list(zip(images.arrays, files, strict=True))[:: math.ceil(len(files) / 10)]:
-        with Image.open(io.BytesIO(file)) as decoded:
-            error = np.asarray(decoded.convert("RGB")).astype(np.int32) - array
-        worst, squares, count = (
-            max(worst, int(abs(error).max())),
-            squares + float((error**2).sum()),
-            count + error.size,
+def _uri(subtype: str, file: bytes) -> str:
+    return f"data:image/{subtype};base64,{base64.b64encode(file).decode()}"
+
+
+def _embed(payload: list[dict[str, Any]], images: Images, budget: float) -> tuple[list[str], str]:
+    """Replace image numbers and FLIP files in the payload by positions in the list of data URIs returned.
+
+    Frames that do not fit get null. Also returns a sentence about the encoding.
+    """
+    flips = sum(len(file) for s in payload for t in s["tracks"] for file in t["flip"]) * 4 / 3
+    name, size = images.choose(max(budget - flips, budget / 2))
+    every = math.ceil((size + flips) / budget)
+    for s in payload:
+        s["embedded"] = thinned(s["extrapolated"], every)
+        for holder, key in [
+            (s, "truth"),
+            (s, "input"),
+            *((t, k) for t in s["tracks"] for k in ("images", "flip")),
+        ]:
+            kept = [x if k else None for x, k in zip(holder[key] or [], s["embedded"], strict=False)]
+            holder[key] = kept or None
+    lists = [s[k] or [] for s in payload for k in ("truth", "input")]
+    lists += [t["images"] for s in payload for t in s["tracks"]]
+    files, about = images.encode(name, {i for some in lists for i in some if i is not None})
+    subtype = "webp" if name.startswith("WebP") else "jpeg"
+    uris = [_uri(subtype, file) for file in files.values()]
+    position = {number: p for p, number in enumerate(files)}
+    for some in lists:
+        some[:] = [None if i is None else position[i] for i in some]
+    for s in payload:
+        for track in s["tracks"]:
+            for i, file in enumerate(track["flip"] or []):
+                if file is not None:
+                    track["flip"][i] = len(uris)
+                    uris.append(_uri("jpeg", file))
+    if every > 1:
+        shown = sum(sum(s["embedded"]) for s in payload)
+        about += (
+            f"; {shown} of {sum(len(s['frames']) for s in payload)} frames have images here, all have numbers"
         )
-    rms = math.sqrt(squares / count)
-    about = f"{name}; error of the encoding: "
-    about += (
-        "none beyond 8 bits" if worst == 0 else f"rms {rms:.2f}, at most {worst} of 255 (sample of frames)"
-    )
-    uris = [f"data:image/{subtype};base64,{base64.b64encode(f).decode()}" for f in files]
-    uris += [f"data:image/jpeg;base64,{base64.b64encode(f).decode()}" for f in flips]
     return uris, about
 
 
@@ -267,6 +187,7 @@ def write_report(
     *,
     title: str,
     meta: Mapping[str, Any] | None = None,
+    fps: float = 4.0,
     max_megabytes: float = MAX_MEGABYTES,
 ) -> Path:
     """Write the comparison page of some sections as one self-contained HTML file.
@@ -276,7 +197,9 @@ def write_report(
         sections: what to show; images display-referred in [0, 1], truth and tracks of one size a section.
         title: heading and window title.
         meta: device, versions, commit, date, settings; shown as given, nested mappings flattened.
-        max_megabytes: aim for the size (10^6 bytes) of the embedded images.
+        fps: speed at which the page plays at first.
+        max_megabytes: aim for the size (10^6 bytes) of the page. It decides how images are encoded; where
+            even JPEG is too large, only every n-th frame gets images.
 
     Returns:
         The path.
@@ -286,12 +209,12 @@ def write_report(
     """
     if not sections:
         raise JaxsrError("no sections to report", where=path)
-    images = _Images()
+    for what, value in (("max_megabytes", max_megabytes), ("fps", fps)):
+        if not (math.isfinite(value) and value > 0):
+            raise JaxsrError("must be a number above 0", where=what, found=value)
+    images = Images()
     payload = [_section_data(section, images) for section in sections]
-    uris, about = _encode(images, max_megabytes * 1e6)
-    for section_data in payload:
-        for track in section_data["tracks"]:
-            track["flip"] = [len(images.arrays) - 1 - i for i in track["flip"]] if track["flip"] else None
+    uris, about = _embed(payload, images, max_megabytes * 1e6)
     keys = [k for k in METRICS if any(k in s.metric_keys() for s in sections)]
     fields = ("label", "unit", "higher_is_better", "digits")
     magma = colormaps["magma"](np.arange(256), bytes=True)[:, :3]
@@ -299,6 +222,7 @@ def write_report(
         "sections": payload,
         "metrics": {k: {f: getattr(METRICS[k], f) for f in fields} for k in keys},
         "colormap": magma.tobytes().hex(),
+        "fps": fps,
         "images": uris,
     }
     exposures = sorted({s.exposure for s in sections})
@@ -330,5 +254,6 @@ def write_report(
     }
     template = package.joinpath("report.html").read_text("utf-8")
     page = re.sub(r"@([A-Z]+)@", lambda m: parts[m[1]], template)
-    write_text(Path(path), page)
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_text(page, encoding="utf-8")
     return Path(path)

@@ -15,21 +15,21 @@ import csv
 import io
 import json
 import math
-import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
+from rich.box import SIMPLE_HEAD
 from rich.markup import escape
 from rich.table import Table
 
 from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.embedding import ImageOrPath, flip_jpeg
+from jaxsr.io.exr import atomic_path
 from jaxsr.metrics import METRICS, flip_map, measure
 
-ImageOrPath: TypeAlias = np.ndarray | Path
 Values: TypeAlias = Sequence[float | None]
 
 
@@ -54,8 +54,8 @@ class Track:
     metrics: Mapping[str, Values]
     timing: Timing | None = None
     note: str = ""
-    flip_maps: Sequence[np.ndarray] = ()
-    """FLIP error maps [H, W] as uint8 (255 is 1) for the page, one a frame; empty if they are not wanted."""
+    flip_maps: Sequence[bytes] = ()
+    """FLIP error maps for the page as grey JPEG (`flip_jpeg`), one a frame; empty if they are not wanted."""
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,7 @@ def measured(
     """
     maps = [flip_map(a, b) for a, b in zip(images, truths, strict=True)]
     found = measure(images, truths, starts=starts, flip_maps=maps)
-    grey = [np.rint(255 * m).astype(np.uint8) for m in maps] if flip_maps else ()
-    return Track(name, images, found, timing, note, grey)
+    return Track(name, images, found, timing, note, [flip_jpeg(m) for m in maps] if flip_maps else ())
 
 
 def summarise(values: Values) -> Summary:
@@ -188,14 +187,14 @@ def number(value: float | None, digits: int) -> str:
     return "∞" if math.isinf(value) else f"{value:.{digits}f}"
 
 
-def cell(found: Summary, key: str) -> str:
-    """Mean ± spread, and the identical frames that are not in it."""
+def cell(found: Summary, key: str, spread: bool = True) -> str:
+    """Mean ± spread, and the identical frames that are not in it (a star if without spread)."""
     digits = METRICS[key].digits
     text = number(found.mean, digits)
-    if found.spread is not None and found.frames > 1:
+    if found.spread is not None and found.frames > 1 and spread:
         text += f" ± {number(found.spread, digits)}"
     if found.identical and found.frames:
-        text += f" (+{found.identical} identical)"
+        text += f" (+{found.identical} identical)" if spread else "*"
     return text
 
 
@@ -212,7 +211,9 @@ def duration(ms: float) -> str:
     return f"{ms:.{digits}f}"
 
 
-def rows(section: Section, subset: str) -> tuple[list[str], list[list[str]], list[list[bool]]]:
+def rows(
+    section: Section, subset: str, spread: bool = True
+) -> tuple[list[str], list[list[str]], list[list[bool]]]:
     """Column titles, the cells of each track, and which of those are the best of their column."""
     positions = section.subsets()[subset]
     keys = section.metric_keys()
@@ -221,11 +222,11 @@ def rows(section: Section, subset: str) -> tuple[list[str], list[list[str]], lis
     columns = ["Method", *(header(k) for k in keys), *(["Frame [ms]", "Compile [s]"] if timed else [])]
     cells, marks = [], []
     for track in section.tracks:
-        line = [track.name, *(cell(summary(track, k, positions), k) for k in keys)]
+        line = [track.name, *(cell(summary(track, k, positions), k, spread) for k in keys)]
         mark = [False, *(track.name in winners[k] for k in keys)]
         if timed:
             t = track.timing
-            line += [f"{duration(t.median_ms)} ± {duration(t.spread_ms)}" if t else "–"]
+            line += [duration(t.median_ms) + (f" ± {duration(t.spread_ms)}" if spread else "") if t else "–"]
             line += [f"{t.compile_s:.1f}" if t else "–"]
             mark += [False, False]
         cells.append(line)
@@ -234,15 +235,21 @@ def rows(section: Section, subset: str) -> tuple[list[str], list[list[str]], lis
 
 
 def rich_tables(sections: Sequence[Section]) -> list[Table]:
-    """One table a section and subset for the terminal, best values bold and green."""
+    """One table of means a section and subset for the terminal, best values bold and green.
+
+    A star: identical frames, whose PSNR is infinite, are not in the mean.
+    """
     tables = []
     for section in sections:
         for subset, positions in section.subsets().items():
-            columns, cells, marks = rows(section, subset)
+            columns, cells, marks = rows(section, subset, spread=False)
             title = f"{escape(section.title)} · {subset} ({len(positions)} frames)"
-            table = Table(title=title, title_justify="left", title_style="bold")
+            table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD)
             for i, column in enumerate(columns):
-                table.add_column(escape(column), justify="right" if i else "left", no_wrap=True)
+                title = escape(column.replace(" [", "\n["))
+                table.add_column(
+                    title, justify="right" if i else "left", no_wrap=i > 0, min_width=0 if i else 12
+                )
             for line, mark in zip(cells, marks, strict=True):
                 pairs = zip(line, mark, strict=True)
                 table.add_row(*(f"[bold green]{escape(c)}[/]" if m else escape(c) for c, m in pairs))
@@ -344,32 +351,15 @@ def as_csv(sections: Sequence[Section]) -> str:
     return text.getvalue()
 
 
-def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all: a temporary file in the same folder, then a rename."""
-    path = Path(path)
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    except OSError as error:
-        raise JaxsrError(f"cannot write: {error.strerror}", where=path) from error
-    try:
-        with os.fdopen(handle, "w", encoding="utf-8", newline="") as file:
-            file.write(text)
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except OSError as error:
-        raise JaxsrError(f"cannot write: {error.strerror}", where=path) from error
-    finally:
-        Path(temporary).unlink(missing_ok=True)
-
-
 def write_metrics(
     folder: Path, sections: Sequence[Section], *, title: str = "", meta: Mapping[str, Any] | None = None
 ) -> None:
     """Write metrics.json, metrics.csv and metrics.md into a folder."""
-    folder = Path(folder)
-    write_text(
-        folder / "metrics.json", json.dumps(as_json(sections, title=title, meta=meta), indent=1) + "\n"
-    )
-    write_text(folder / "metrics.csv", as_csv(sections))
-    write_text(folder / "metrics.md", markdown(sections))
+    texts = {
+        "metrics.json": json.dumps(as_json(sections, title=title, meta=meta), indent=1) + "\n",
+        "metrics.csv": as_csv(sections),
+        "metrics.md": markdown(sections),
+    }
+    for name, text in texts.items():
+        with atomic_path(Path(folder) / name) as temporary:
+            temporary.write_text(text, encoding="utf-8")

@@ -1,0 +1,276 @@
+"""Any folders of frames against the truth: `jaxsr compare A B --truth T`.
+
+PNG and JPEG are taken as they are, display-referred. OpenEXR is linear colour and goes through the tone map
+of jaxsr; what the page shows of it is written to `out/frames/` and `out/truth/` as 8-bit PNG. A folder
+may be a jaxsr sequence (its HR colour counts) or what `jaxsr upscale` wrote (its `exr/` or `png/`).
+
+Frames are matched by the last number in the file name where all names of a folder have one, else by sorted
+name. Memory does not grow with the number of frames, apart from the small FLIP maps of the page.
+"""
+
+import re
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.embedding import flip_jpeg
+from jaxsr.evaluation.report import write_report
+from jaxsr.evaluation.tables import Section, Track, write_metrics
+from jaxsr.io.images import read_color, read_png, write_png
+from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.metrics import METRICS, flip_map, measure, temporal_psnr
+from jaxsr.ops.color import to_display
+
+Progress = Callable[[str, int], Callable[[], Any]]
+"""Called with a title and a number of steps; gives what is called after each step."""
+
+_PLAIN = (".png", ".jpg", ".jpeg")
+_INNER = ("exr", "png")
+
+
+class Frames(NamedTuple):
+    """The files of a folder in order."""
+
+    folder: Path
+    files: tuple[Path, ...]
+    numbers: tuple[int, ...] | None
+    """The number of each file, or None if the names do not all have one of their own."""
+
+
+def find_frames(folder: Path, prefer: str = "exr") -> Frames:
+    """The frames of a folder: images in it, in `hr/` of a sequence, or in its `exr/` or `png/`.
+
+    Raises:
+        JaxsrError: no such folder, no images in it, or images of both kinds.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise JaxsrError("no such folder", where=folder, found="a file" if folder.exists() else None)
+    inner = folder
+    if (folder / "sequence.json").is_file():
+        inner = folder / "hr"
+    elif not _images(folder):
+        there = [name for name in _INNER if (folder / name).is_dir()]
+        inner = folder / (prefer if prefer in there else there[0]) if there else folder
+    files = _images(inner)
+    if not files:
+        raise JaxsrError("no frames in the folder", where=inner, expected="files .exr, .png or .jpg")
+    if len({f.suffix.lower() in _PLAIN for f in files}) > 1:
+        raise JaxsrError(
+            "the folder holds OpenEXR and PNG or JPEG frames",
+            where=inner,
+            fix="put them into folders of their own",
+        )
+    digits = [re.findall(r"\d+", f.stem) for f in files]
+    if not all(digits) or len({int(d[-1]) for d in digits}) != len(files):
+        return Frames(folder, tuple(files), None)
+    ordered = sorted((int(d[-1]), f) for d, f in zip(digits, files, strict=True))
+    return Frames(folder, tuple(f for _, f in ordered), tuple(n for n, _ in ordered))
+
+
+def _images(folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        return []
+    kinds = (".exr", *_PLAIN)
+    return sorted(f for f in folder.iterdir() if f.suffix.lower() in kinds and not f.name.startswith("."))
+
+
+def check_match(found: Frames, truth: Frames) -> None:
+    """See that a folder has exactly the frames of the truth.
+
+    Raises:
+        JaxsrError: it has others, with both counts and the first frame that is missing.
+    """
+    counts = {"expected": f"{len(truth.files)} frames", "found": f"{len(found.files)} frames"}
+    if found.numbers is not None and truth.numbers is not None:
+        missing = sorted(set(truth.numbers) - set(found.numbers))
+        extra = sorted(set(found.numbers) - set(truth.numbers))
+        if missing:
+            file = truth.files[truth.numbers.index(missing[0])].name
+            what = f"frame {missing[0]} is missing (truth: {file})"
+            raise JaxsrError(what, where=found.folder, **counts, fix=_renumber(found, truth))
+        if extra:
+            file = found.files[found.numbers.index(extra[0])].name
+            raise JaxsrError(f"frame {extra[0]} ({file}) has no truth", where=found.folder, **counts)
+    elif len(found.files) != len(truth.files):
+        shorter, longer = sorted((found, truth), key=lambda f: len(f.files))
+        first = longer.files[len(shorter.files)].name
+        place = "truth" if shorter is truth else "folder"
+        raise JaxsrError(
+            f"unequal numbers of frames, the {place} has none for {first}", where=found.folder, **counts
+        )
+
+
+def _renumber(found: Frames, truth: Frames) -> str | None:
+    if len(found.files) != len(truth.files) or found.numbers is None or truth.numbers is None:
+        return None
+    return (
+        f"files are numbered from {found.numbers[0]}, those of the truth from {truth.numbers[0]}: "
+        "rename them if they show the same frames"
+    )
+
+
+def labels(folders: Sequence[Path]) -> list[str]:
+    """A name for each folder: its own, with as many parents as tell it from the others.
+
+    A last part that only says the kind of file (`exr`, `png`, `hr`) gives way to the folder above.
+    """
+    parts = []
+    for folder in folders:
+        path = Path(folder).resolve()
+        parts.append((path.parent if path.name in (*_INNER, "hr") and path.parent.name else path).parts)
+    for depth in range(1, max(map(len, parts)) + 1):
+        names = ["/".join(p[-depth:]) for p in parts]
+        if len(set(names)) == len(names):
+            return names
+    raise JaxsrError("the same folder is given twice", found=", ".join(str(f) for f in folders))
+
+
+def read_display(path: Path, exposure: float) -> np.ndarray:
+    """A frame as display-referred float32 [H, W, 3] in [0, 1].
+
+    Raises:
+        JaxsrError: unreadable or truncated file, no colour in it, NaN or infinity.
+    """
+    if path.suffix.lower() != ".exr":
+        return read_png(path)
+    linear = read_color(path)
+    bad = np.argwhere(~np.isfinite(linear).all(axis=-1))
+    if len(bad):
+        y, x = (int(v) for v in bad[0])
+        raise JaxsrError(
+            "the frame holds NaN or infinity",
+            where=path,
+            found=f"{len(bad)} pixels, the first at x={x} y={y}",
+        )
+    return np.asarray(to_display(linear, exposure))
+
+
+def _starts(truth: Frames) -> list[bool]:
+    """True where a frame does not follow the one before it: a gap in the numbers, or a cut of a sequence."""
+    if truth.numbers is None:
+        return [i == 0 for i in range(len(truth.files))]
+    steps = np.diff(truth.numbers)
+    found = [True, *(bool(s != steps.min()) for s in steps)]
+    if (truth.folder / "sequence.json").is_file():
+        cuts = {info.index for info in FrameSequence.open(truth.folder).infos if info.cut}
+        found = [start or n in cuts for start, n in zip(found, truth.numbers, strict=True)]
+    return found
+
+
+def compare(
+    folders: Sequence[Path],
+    truth: Path,
+    out: Path,
+    *,
+    exposure: float | None = None,
+    fps: float = 4.0,
+    title: str = "",
+    meta: Mapping[str, Any] | None = None,
+    max_megabytes: float = 18.0,
+    progress: Progress | None = None,
+) -> Section:
+    """Measure folders of frames against the truth; write report.html, metrics.json, .csv and .md into `out`.
+
+    Args:
+        folders: one a method; see the module for what a folder may be.
+        truth: the true frames.
+        out: where the results go; made if it is not there.
+        exposure: factor on linear colour before the tone map; by default that of the truth if it is a
+            sequence, else 1.
+        fps: speed at which the page plays at first.
+        meta: shown on the page and kept with the numbers.
+        max_megabytes: aim for the size of the page.
+        progress: for a progress bar.
+
+    Returns:
+        What was measured; `rich_tables([section])` prints it.
+
+    Raises:
+        JaxsrError: a folder is missing or empty, frames do not match, sizes differ, a file cannot be read.
+    """
+    if not folders:
+        raise JaxsrError("no folders to compare", fix="name at least one folder of frames")
+    truth, out = Path(truth), Path(out)
+    true = find_frames(truth)
+    kind = "png" if true.files[0].suffix.lower() in _PLAIN else "exr"
+    found = [find_frames(Path(folder), prefer=kind) for folder in folders]
+    names = labels([Path(folder) for folder in folders])
+    for frames in found:
+        check_match(frames, true)
+    if exposure is None:
+        is_sequence = (truth / "sequence.json").is_file()
+        exposure = FrameSequence.open(truth).exposure if is_sequence else 1.0
+    starts = _starts(true)
+    advance = progress("measuring", len(found) * len(true.files)) if progress else lambda: None
+    shown = _Shown(out, exposure)
+    tracks = [
+        _measured(name, frames, true, starts, shown, advance)
+        for name, frames in zip(names, found, strict=True)
+    ]
+    section = Section(
+        title=f"{truth.resolve().name}: {', '.join(names)}" if len(names) < 4 else truth.resolve().name,
+        frames=true.numbers or tuple(range(1, len(true.files) + 1)),
+        truths=[shown.path("truth", file) for file in true.files],
+        tracks=tracks,
+        exposure=exposure,
+        meta={"truth": str(truth), **{name: str(f) for name, f in zip(names, folders, strict=True)}},
+    )
+    title = title or f"{' · '.join(names)} against {truth.resolve().name}"
+    write_report(out / "report.html", [section], title=title, meta=meta, fps=fps, max_megabytes=max_megabytes)
+    write_metrics(out, [section], title=title, meta=meta)
+    return section
+
+
+class _Shown(NamedTuple):
+    """Where the page finds a frame: a plain picture as it is, OpenEXR as a PNG made from it."""
+
+    out: Path
+    exposure: float
+
+    def read(self, label: str, file: Path) -> np.ndarray:
+        """The display-referred frame; the PNG of an OpenEXR frame is written on the way."""
+        image = read_display(file, self.exposure)
+        path = self.path(label, file)
+        if path != file:
+            write_png(path, image)
+        return image
+
+    def path(self, label: str, file: Path) -> Path:
+        if file.suffix.lower() in _PLAIN:
+            return file
+        return self.out / label / f"{file.stem}.png"
+
+
+def _measured(
+    name: str, frames: Frames, true: Frames, starts: Sequence[bool], shown: _Shown, advance: Callable[[], Any]
+) -> Track:
+    """All metrics of a folder, two frames in memory at a time."""
+    values: dict[str, list[float | None]] = {key: [] for key in METRICS}
+    maps: list[bytes] = []
+    before: tuple[np.ndarray, np.ndarray] | None = None
+    for i, (file, true_file) in enumerate(zip(frames.files, true.files, strict=True)):
+        truth, image = shown.read("truth", true_file), shown.read(f"frames/{name}", file)
+        first = truth if before is None else before[1]
+        for array, path, size in ((truth, true_file, first.shape), (image, file, truth.shape)):
+            if array.shape != size:
+                raise JaxsrError(
+                    "wrong size",
+                    where=path,
+                    expected=f"{size[1]}x{size[0]}",
+                    found=f"{array.shape[1]}x{array.shape[0]}",
+                )
+        error = flip_map(image, truth)
+        found = measure([image], [truth], flip_maps=[error])
+        if before is not None:
+            pair = temporal_psnr([before[0], image], [before[1], truth], starts=[True, starts[i]])
+            found["tpsnr"] = pair[1:]
+        for key, one in found.items():
+            values[key] += one
+        maps.append(flip_jpeg(error))
+        before = (image, truth)
+        advance()
+    return Track(name, [shown.path(f"frames/{name}", file) for file in frames.files], values, flip_maps=maps)
