@@ -55,7 +55,7 @@ number mean nothing.
 ## Limits
 
 - Synthetic, three scenes; no characters, no volumes, no transparency or refraction, constant focal length.
-- The sample that ships with the package is rounded (mantissa bits: {bits}) so that it is small.
+- The archives are quantised; the table in `jaxsr/io/archive_coding.py` gives the errors of each layer.
 - Mirror-like reflections move otherwise than the motion vectors, which follow the surface.
 """
 
@@ -82,8 +82,6 @@ def write(out: Path, floors: Path, docs: Path) -> Path:
     Raises:
         JaxsrError: no sequences below `out`.
     """
-    from experiments.make_datasets import SAMPLE_BITS
-
     found = [(name, p.parent) for name in SETS for p in sorted((out / name).glob("*/sequence.json"))]
     if not found:
         raise JaxsrError("no sequences", where=out, fix="render some first")
@@ -127,7 +125,6 @@ def write(out: Path, floors: Path, docs: Path) -> Path:
         note=f" ({unknown} sequences came from an archive, without their cost)" if unknown else "",
         blender=", ".join(sorted(versions)),
         floors="\n".join(lines) or "| not measured | | | | |",
-        bits=", ".join(f"{k} {v}" for k, v in SAMPLE_BITS.items()),
     )
     path = docs / "data_card.md"
     with atomic_path(path) as temporary:

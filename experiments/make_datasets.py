@@ -43,9 +43,10 @@ from rich.progress import (  # noqa: E402
     TimeRemainingColumn,
 )
 
-from experiments import dataset_archive, dataset_card  # noqa: E402
+from experiments import dataset_card  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.io import blender  # noqa: E402
+from jaxsr.io.archive import pack, read_manifest, unpack_sequence, verify  # noqa: E402
 from jaxsr.io.blender_convert import convert_color  # noqa: E402
 from jaxsr.io.blender_process import BlenderProcess, find_blender  # noqa: E402
 from jaxsr.io.exr import atomic_path, read_exr  # noqa: E402
@@ -58,17 +59,6 @@ LICENSE = "CC0-1.0"
 FLOORS = ROOT / "experiments" / "results" / "noise_floor.json"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsr" / "datasets"
 SHARED = ROOT.parent / "shared" / "datasets"
-# Bits of mantissa kept in the sample that ships with the package (results/sample_rounding.json).
-SAMPLE_BITS = {
-    "color": 6,
-    "normal": 6,
-    "base_color": 5,
-    "roughness": 6,
-    "metallic": 6,
-    "depth": 14,
-    "motion": 9,
-}
-
 Set = Literal["sample", "train", "test"]
 
 
@@ -141,7 +131,7 @@ class Pack:
 
     dir: Annotated[Path, tyro.conf.Positional]
     archive: Annotated[Path, tyro.conf.Positional]
-    color_bits: int = 6
+    color_bits: int = 5
     max_megabytes: float = 200.0
 
 
@@ -205,12 +195,12 @@ def find_archives(search: Path | None) -> list[Path]:
 def from_archive(config: Render, clip: Clip, folder: Path) -> bool:
     """Unpacks the clip if an archive holds it at this size; tells whether it did."""
     for archive in find_archives(config.search):
-        manifest = dataset_archive.read_manifest(archive)
+        manifest = read_manifest(archive)
         name = f"{config.set}/{clip.name}"
         head = manifest["sequences"].get(name)
         if head is None or tuple(head["size"]) != size_of(config) or len(head["frames"]) < clip.frames:
             continue
-        dataset_archive.unpack_sequence(archive, manifest, name, folder)
+        unpack_sequence(archive, manifest, name, folder)
         return True
     return False
 
@@ -275,8 +265,6 @@ def _render_clip(
             name=clip.name,
             license=LICENSE,
             scene_arguments=arguments,
-            round_bits=SAMPLE_BITS if config.set == "sample" else None,
-            precision={"motion": "half"} if config.set == "sample" else None,
             blender=config.blender,
             log=folder.parent / "logs" / f"{clip.name}.log",
             progress=report,
@@ -399,7 +387,7 @@ def pack_set(config: Pack, console: Console) -> None:
         seq = Sequence.open(folder)
         members += len(seq) * len(seq.resolutions)
     with bar(console, members, "pack") as (progress, task):
-        digest = dataset_archive.pack(
+        digest = pack(
             names,
             config.archive,
             config.color_bits,
@@ -415,11 +403,11 @@ def unpack_set(config: Unpack, console: Console) -> None:
     if not archives:
         raise JaxsrError("no archive", expected=f"*.jsrz in --search or {SHARED}", fix="or give --archive")
     for archive in archives:
-        manifest = dataset_archive.read_manifest(archive)
-        dataset_archive.verify(archive)
+        manifest = read_manifest(archive)
+        verify(archive)
         with bar(console, len(manifest["sequences"]), "unpack") as (progress, task):
             for name in manifest["sequences"]:
-                dataset_archive.unpack_sequence(archive, manifest, name, config.out / name)
+                unpack_sequence(archive, manifest, name, config.out / name)
                 progress.update(task, advance=1, description=f"unpack {name}")
 
 

@@ -1,47 +1,36 @@
-"""A rendered data set in one small file, and back: quantisation, lossless coding, checksums.
+"""One image of a sequence in few bytes: quantisation, then lossless coding of integer planes.
 
-The archive is a ZIP file (stored, readable by any tool) of `manifest.json` and one member a frame and
-resolution. `manifest.json` holds each sequence's `sequence.json` word for word, the quantisation, and the
-SHA-256 of every member; `ARCHIVE.sha256` beside the archive holds that of the whole.
-
-Quantisation (what `unpack` returns differs from what was packed by at most this):
+What `decode_frame` returns differs from what `encode_frame` was given by at most this:
 
 | layer | stored as | error |
 |---|---|---|
 | color | half float, mantissa rounded to `color_bits` | relative 2^-(color_bits + 1); negatives become 0 |
 | depth | 16-bit logarithm between the image's extremes, 65535 for sky | relative (log range) / 131068 |
 | motion | rest over the camera's motion at that depth, in steps of 1/64 pixel | 1/128 pixel |
-| normal | octahedral, 8 bits a coordinate | 0.9 degrees |
-| base_color | 8 bits, sRGB curve | half a step |
+| normal | octahedral, 8 bits a coordinate | 0.95 degrees |
+| base_color | 8 bits, sRGB curve, clipped to [0, 1] | half a step |
 | roughness, metallic | 8 bits, linear | 1/510 |
 | object_id | exact | 0 |
 
-World position is not stored: it is rebuilt from depth. The integer planes are coded without loss: green taken
-from red and blue, the best of four linear predictors, bytes of equal significance together, LZMA.
+World position is not stored: it is rebuilt from depth. Of the integer planes, green is taken from red and
+blue; then come the best of four linear predictors, bytes of equal significance together, LZMA.
 """
 
-import hashlib
 import io
 import json
 import lzma
 import struct
-import zipfile
-from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
-from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import atomic_path, read_exr
-from jaxsr.io.sequence import Sequence, world_position
-from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter, frame_file
+from jaxsr.io.sequence import world_position
+from jaxsr.io.writing import FrameInfo
 
-FORMAT, VERSION = "jaxsr-archive", 1
 MOTION_STEP = 64.0
 SKY_CODE = 65535
-_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 0, "lp": 0, "pb": 0}]
-_EPOCH = (1980, 1, 1, 0, 0, 0)
+_FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 4, "lp": 0, "pb": 0}]
 
 
 # --- quantisation ----------------------------------------------------------------------------------------
@@ -244,154 +233,3 @@ def decode_frame(
     if "object_id" in codes:
         layers["object_id"] = np.asarray(notes["ids"], np.float64)[codes["object_id"]]
     return {name: np.asarray(x, np.float32) for name, x in layers.items()}
-
-
-# --- the archive -----------------------------------------------------------------------------------------
-
-
-def _raw_layers(path: Path) -> dict[str, np.ndarray]:
-    channels, _ = read_exr(path, pad=False)
-    return {
-        layer: np.stack([channels[f"{layer}.{c}"].astype(np.float32) for c in letters], -1)
-        for layer, letters in LAYERS.items()
-        if layer != "position" and f"{layer}.{letters[0]}" in channels
-    }
-
-
-def _images(
-    infos: list[FrameInfo], resolutions: Iterable[str]
-) -> Iterable[tuple[FrameInfo, FrameInfo, str, Any]]:
-    """(frame, the one before, resolution, jitter) of every image, in the order of the archive."""
-    for k, info in enumerate(infos):
-        before = infos[k - 1] if k and not info.cut else info
-        for resolution in resolutions:
-            yield info, before, resolution, (0.0, 0.0) if resolution == "hr" else info.jitter_px
-
-
-def pack(
-    sequences: Mapping[str, Path],
-    archive: Path,
-    color_bits: int = 6,
-    max_megabytes: float = 200.0,
-    progress: Callable[[str, int], None] = lambda name, size: None,
-) -> str:
-    """Write the archive and its checksum file; returns the SHA-256 of the whole.
-
-    Args:
-        sequences: name in the archive ("train/bunker-train-0") -> folder.
-        archive: the file to write.
-        color_bits: mantissa bits kept of the colour, 1 to 10.
-        max_megabytes: refuse to grow beyond.
-        progress: called with the name and size of each member.
-
-    Raises:
-        JaxsrError: too large, or a sequence that cannot be read.
-    """
-    manifest: dict[str, Any] = {
-        "format": FORMAT, "version": VERSION, "color_bits": color_bits, "sequences": {}, "members": {},
-    }  # fmt: skip
-    total = 0
-    with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as file:
-        for name, folder in sequences.items():
-            seq = Sequence.open(folder)
-            manifest["sequences"][name] = json.loads((folder / "sequence.json").read_text())
-            for info, before, resolution, jitter in _images(seq.infos, seq.resolutions):
-                layers = _raw_layers(frame_file(folder, resolution, info.index))
-                blob = encode_frame(layers, info, before, jitter, color_bits)
-                member = f"{name}/{resolution}/{info.index:04d}"
-                file.writestr(zipfile.ZipInfo(member, _EPOCH), blob)
-                manifest["members"][member] = hashlib.sha256(blob).hexdigest()
-                total += len(blob)
-                progress(member, len(blob))
-                if total > max_megabytes * 1e6:
-                    raise JaxsrError(
-                        "the archive grows too large",
-                        where=archive,
-                        expected=f"at most {max_megabytes:g} MB",
-                        found=f"{total / 1e6:.0f} MB with {name} unfinished",
-                        fix="keep fewer bits of colour (--color-bits) or pack fewer sequences",
-                    )
-        file.writestr(zipfile.ZipInfo("manifest.json", _EPOCH), json.dumps(manifest, indent=1))
-    digest = file_digest(archive)
-    with atomic_path(archive.with_name(archive.name + ".sha256")) as temporary:
-        temporary.write_text(f"{digest}  {archive.name}\n")
-    return digest
-
-
-def file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-def read_manifest(archive: Path) -> dict[str, Any]:
-    """The manifest of an archive.
-
-    Raises:
-        JaxsrError: missing, not an archive of ours, another version.
-    """
-    try:
-        with zipfile.ZipFile(archive) as file:
-            manifest = json.loads(file.read("manifest.json"))
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
-        raise JaxsrError("not an archive of a data set", where=archive, found=e) from e
-    if manifest.get("format") != FORMAT or manifest.get("version") != VERSION:
-        found = f"{manifest.get('format')} {manifest.get('version')}"
-        raise JaxsrError(
-            "another kind of archive", where=archive, expected=f"{FORMAT} {VERSION}", found=found
-        )
-    return manifest
-
-
-def verify(archive: Path) -> None:
-    """Compare the whole with ARCHIVE.sha256, where that exists."""
-    beside = archive.with_name(archive.name + ".sha256")
-    if beside.is_file() and beside.read_text().split()[0] != file_digest(archive):
-        raise JaxsrError("the checksum does not match", where=archive, expected=f"that of {beside.name}")
-
-
-def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folder: Path) -> Path:
-    """Write one sequence of the archive to a folder; resumes.
-
-    Raises:
-        JaxsrError: a member is missing or damaged.
-    """
-    head = dict(manifest["sequences"][name])
-    infos = []
-    for entry in head["frames"]:
-        camera = [
-            np.asarray(entry["camera"][key]) for key in ("world_from_view", "tan_half_fov", "lens_shift")
-        ]
-        jitter = (entry["jitter_px"][0], entry["jitter_px"][1])
-        infos.append(FrameInfo(entry["index"], jitter, entry["cut"], *camera))
-    writer = SequenceWriter(
-        folder,
-        name=head["name"],
-        size=tuple(head["size"]),
-        scales=head["scales"],
-        fps=head["fps"],
-        exposure=head["exposure"],
-        license=head["license"],
-        generator=head["generator"]
-        | {"quantised": f"{FORMAT} {VERSION}, {manifest['color_bits']} bits of colour"},
-        precision={"motion": "float"},
-    )
-    images: dict[int, dict[str, dict[str, np.ndarray]]] = {}
-    with zipfile.ZipFile(archive) as file:
-        for info, before, resolution, jitter in _images(infos, writer.resolutions):
-            if writer.has(info.index):
-                continue
-            member = f"{name}/{resolution}/{info.index:04d}"
-            try:
-                blob = file.read(member)
-            except (KeyError, zipfile.BadZipFile) as e:
-                raise JaxsrError(f"member {member!r} cannot be read", where=archive, found=e) from e
-            if hashlib.sha256(blob).hexdigest() != manifest["members"].get(member):
-                raise JaxsrError(
-                    f"member {member!r} is damaged", where=archive, fix="fetch the archive again"
-                )
-            images.setdefault(info.index, {})[resolution] = decode_frame(blob, info, before, jitter)
-            if len(images[info.index]) == len(writer.resolutions):
-                done = images.pop(info.index)
-                writer.write_frame(info, done.pop("hr"), {int(r[1:]): x for r, x in done.items()})
-    writer.close()
-    return folder
