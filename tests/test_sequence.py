@@ -1,8 +1,10 @@
 """jaxsr.io.sequence and jaxsr.io.writing: round trips, resuming, and one clear line for each thing wrong."""
 
 import json
+import re
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +13,7 @@ from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.sequence import FrameInfo, Sequence, SequenceWriter, prefetch
-from jaxsr.io.writing import round_mantissa
+from jaxsr.io.writing import LAYERS, round_mantissa
 from tests.builders import frame_info, halton_jitter, make_sequence
 
 SIZE = (32, 24)
@@ -365,3 +367,15 @@ def test_prefetch_hands_errors_over(seq):
     assert next(frames).cut
     with pytest.raises(JaxsrError, match="no such file"):
         next(frames)
+
+
+def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch):
+    text = (Path(__file__).parents[1] / "docs/data.md").read_text()
+    monkeypatch.chdir(tmp_path)
+    for block in re.findall(r"```python\n(.*?)```", text, re.S):
+        exec(block, {})
+    assert len(Sequence.open(tmp_path / "wall")) == 3
+    head = json.loads(re.search(r"```json\n(.*?)```", text, re.S)[1])
+    assert set(head) == set(json.loads((tmp_path / "wall/sequence.json").read_text()))
+    for layer, letters in LAYERS.items():
+        assert f"| {layer} | {layer}.{letters[0]}" in text
