@@ -168,6 +168,8 @@ def flip_map(image: Image, truth: Image, ppd: float = FLIP_PPD) -> Float[np.ndar
     image_, truth_ = _checked(image, truth)
     if not (math.isfinite(ppd) and ppd > 0.0):
         raise JaxsrError("pixels per degree must be positive", where="ppd", found=ppd)
+    # The binding takes only writable arrays in C order; those that come from JAX are read-only.
+    truth_, image_ = np.array(truth_, order="C"), np.array(image_, order="C")
     error, _, _ = flip_evaluator.evaluate(
         truth_, image_, "LDR", applyMagma=False, computeMeanError=False, parameters={"ppd": ppd}
     )

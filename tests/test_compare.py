@@ -180,8 +180,10 @@ def shifted(root):
 
 
 def unnumbered(root):
-    write_folder(root / "bad", numbers=(1, 2), name="frame" + "{:.0s}")  # one file, no number
-    return r"unequal numbers of frames, the folder has none for 0002.png; expected 3 frames", root / "bad"
+    (root / "bad").mkdir()
+    for word in ("ant", "bee"):
+        write_png(root / "bad" / f"{word}.png", frame(1))
+    return r"unequal numbers of frames, the folder has none for 0003.png; expected 3 frames", root / "bad"
 
 
 def wrong_size(root):

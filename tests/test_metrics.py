@@ -85,6 +85,9 @@ def test_symmetry_and_jax_arrays():
     for fn in (metrics.psnr, metrics.ssim):
         assert fn(image, truth) == pytest.approx(fn(truth, image), abs=1e-6)
         assert fn(jnp.asarray(image), jnp.asarray(truth)) == pytest.approx(fn(image, truth), abs=1e-6)
+    assert metrics.flip(jnp.asarray(image), jnp.asarray(truth)) == metrics.flip(image, truth)
+    turned = np.asfortranarray(image), np.asfortranarray(truth)
+    assert metrics.flip(*turned) == metrics.flip(image, truth)
     mirrored = metrics.ssim(image[:, ::-1], truth[:, ::-1])
     assert mirrored == pytest.approx(metrics.ssim(image, truth), abs=1e-6)
 
