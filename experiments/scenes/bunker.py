@@ -23,13 +23,13 @@ import common as co
 from bunker_kit import Part, bend, library, sign, spin
 
 SETTINGS = {
-    "test_samples": 48,
+    "test_samples": 64,
     "train_samples": 16,
     "denoise": True,
     "max_bounces": 1,
     "diffuse_bounces": 0,
     "glossy_bounces": 1,
-    "exposure": 1.25,
+    "exposure": 1.35,
 }
 
 FLICKER = ((1.0, 0.96, 0.90), (1.0, 0.72, 0.10), (0.12, 0.28, 1.0), (1.0, 0.07, 0.04))
@@ -93,10 +93,16 @@ def shot(kind: str, split: str, rng: random.Random) -> Walk:
                     phase=phase)  # fmt: skip
     if kind == "gallery":
         if test:
-            return Walk((5.9, 21.5 + jitter, 4.9), 180, 0.07, look=-46, look_rate=-0.5, pitch=-17, phase=phase)
-        return Walk((5.9, 4.5 + jitter, 4.9), 0, 0.07, look=44 + 5 * jitter, look_rate=0.5, pitch=-17, phase=phase)
+            return Walk(
+                (5.9, 21.5 + jitter, 4.9), 180, 0.07, look=-46, look_rate=-0.5, pitch=-17, phase=phase
+            )
+        return Walk(
+            (5.9, 4.5 + jitter, 4.9), 0, 0.07, look=44 + 5 * jitter, look_rate=0.5, pitch=-17, phase=phase
+        )
     if test:
-        return Walk((1.5, 15.5 + jitter, 1.6), 10, 0.075, look=-62, look_rate=0.55 * side, pitch=-2, phase=phase)
+        return Walk(
+            (1.5, 15.5 + jitter, 1.6), 10, 0.075, look=-62, look_rate=0.55 * side, pitch=-2, phase=phase
+        )
     return Walk((1.2, 5.0 + jitter, 1.6), 0, 0.075, look=-58, look_rate=0.55 * side, pitch=-2, phase=phase)
 
 
@@ -112,7 +118,11 @@ class Place:
 
     def free(self, x: float, y: float, radius: float, clear: float = 0.75, low: bool = True) -> bool:
         """Whether a disc on the floor is clear of the camera's path and of what stands there; if so, take it."""
-        near = min(math.hypot(p.x - x, p.y - y) for p in self.path if not low or p.z < 3) if self.low(low) else 99
+        near = (
+            min(math.hypot(p.x - x, p.y - y) for p in self.path if not low or p.z < 3)
+            if self.low(low)
+            else 99
+        )
         if near < radius + clear or any(math.hypot(a - x, b - y) < r + radius for a, b, r in self.taken):
             return False
         self.taken.append((x, y, radius))
@@ -125,7 +135,9 @@ class Place:
 # --- shell ----------------------------------------------------------------------------------------------
 
 
-def wall(part: Part, a: tuple, b: tuple, height: float, mat: str, openings: list[tuple] = (), base=0.0) -> None:
+def wall(
+    part: Part, a: tuple, b: tuple, height: float, mat: str, openings: list[tuple] = (), base=0.0
+) -> None:
     """A wall 0.3 m thick along x or y from `a` to `b`; openings are (from, to, sill, head) along it."""
     along = 0 if a[1] == b[1] else 1
     start, end = min(a[along], b[along]), max(a[along], b[along])
@@ -205,7 +217,9 @@ def shell(p: Place) -> None:
     lines.object("lines")
 
 
-def grating(p: Place, x0: float, x1: float, y0: float, y1: float, z: float, name: str, pitch: float = 0.085) -> None:
+def grating(
+    p: Place, x0: float, x1: float, y0: float, y1: float, z: float, name: str, pitch: float = 0.085
+) -> None:
     """Bearing bars along y, cross bars and an edge frame; one looks through it."""
     g = p.part()
     count = int((x1 - x0) / pitch)
@@ -224,7 +238,9 @@ def grating(p: Place, x0: float, x1: float, y0: float, y1: float, z: float, name
 # --- pipes ----------------------------------------------------------------------------------------------
 
 
-def pipe(p: Place, points: list, radius: float, mat: str, flange: float = 2.2, flange_mat: str = "steel") -> None:
+def pipe(
+    p: Place, points: list, radius: float, mat: str, flange: float = 2.2, flange_mat: str = "steel"
+) -> None:
     """A pipe with rounded corners and bolted flanges along its straight runs."""
     g = p.part()
     g.tube(bend(points, max(2.2 * radius, 0.12)), radius, mat, 16)
@@ -234,7 +250,9 @@ def pipe(p: Place, points: list, radius: float, mat: str, flange: float = 2.2, f
         for i in range(int(length / flange)):
             at = a + way * (flange * (i + 0.5))
             for gap in (-0.035, 0.035):
-                g.rod(at + way * (gap - 0.022), at + way * (gap + 0.022), radius * 1.55 + 0.01, flange_mat, 16)
+                g.rod(
+                    at + way * (gap - 0.022), at + way * (gap + 0.022), radius * 1.55 + 0.01, flange_mat, 16
+                )
             g.rod(at - way * 0.22, at - way * 0.16, radius * 1.1, "dark", 16)
     g.object("pipe")
 
@@ -283,7 +301,9 @@ def pipe_rack(p: Place, x: float, y0: float, y1: float, top: float, face: int) -
     b = p.part()
     y = y0 + 0.5
     while y < y1:
-        b.box((min(x, x + face * 0.07), y - 0.035, 0.25), (max(x, x + face * 0.07), y + 0.035, z + 0.1), "dark")
+        b.box(
+            (min(x, x + face * 0.07), y - 0.035, 0.25), (max(x, x + face * 0.07), y + 0.035, z + 0.1), "dark"
+        )
         y += 2.4
     b.object("brackets")
 
@@ -326,7 +346,9 @@ def tray(p: Place, x: float, y0: float, y1: float, z: float) -> None:
 
 def crate(p: Place, x: float, y: float, size: float, yaw: float, z: float = 0.0) -> None:
     g, h = p.part(), size / 2
-    body, frame = p.rng.choice((("wood", "wood"), ("wood_green", "wood_green"), ("plate", "yellow"), ("blue", "steel")))
+    body, frame = p.rng.choice(
+        (("wood", "wood"), ("wood_green", "wood_green"), ("plate", "yellow"), ("blue", "steel"))
+    )
     g.box((-h + 0.03, -h + 0.03, 0.03), (h - 0.03, h - 0.03, size - 0.03), body)
     w = 0.075
     for a in (-h, h - w):
@@ -341,7 +363,16 @@ def barrel(p: Place, x: float, y: float, z: float = 0.0) -> None:
     g = p.part()
     mat = p.rng.choice(("teal", "red", "yellow", "blue", "rusty", "green"))
     r = 0.29
-    profile = [(r, 0), (r, 0.28), (r + 0.02, 0.30), (r, 0.32), (r, 0.58), (r + 0.02, 0.60), (r, 0.62), (r, 0.88)]
+    profile = [
+        (r, 0),
+        (r, 0.28),
+        (r + 0.02, 0.30),
+        (r, 0.32),
+        (r, 0.58),
+        (r + 0.02, 0.60),
+        (r, 0.62),
+        (r, 0.88),
+    ]
     g.tube([(0, 0, h) for _, h in profile], [q for q, _ in profile], mat, 20)
     g.ring((0, 0, 0.88), "Z", r, 0.018, mat, 20, 6)
     g.rod((0, 0, 0.44), (0, 0, 0.53), r + 0.004, p.rng.choice(("stripes", "white_line", "stripes_red")), 20)
@@ -378,7 +409,11 @@ def panel(p: Place, x: float, y: float, face: tuple[float, float], z: float = 1.
         mat = p.rng.choice(("lamp_red", "lamp_green", "lamp_warm", "dark"))
         g.rod((0.29, 0.22, z + 0.46 + 0.11 * i), (0.29, 0.25, z + 0.46 + 0.11 * i), 0.035, mat, 10)
     for i in range(6):
-        g.box((-0.36 + 0.12 * i, 0.21, z + 0.12), (-0.29 + 0.12 * i, 0.25, z + 0.30), p.rng.choice(("red", "white")))
+        g.box(
+            (-0.36 + 0.12 * i, 0.21, z + 0.12),
+            (-0.29 + 0.12 * i, 0.25, z + 0.30),
+            p.rng.choice(("red", "white")),
+        )
     for dx in (-0.3, -0.1, 0.25):
         g.rod((dx, 0.08, z + 0.9), (dx, 0.08, 3.25), 0.025, "galvanised", 8)
     g.object("panel", (x, y, 0), yaw)
@@ -406,7 +441,9 @@ def shelf(p: Place, x: float, y: float, yaw: float) -> None:
                     g.box((at + 0.05, -d / 2 - 0.004, z + h * 0.4), (at + 0.18, -d / 2, z + h * 0.7), "white")
             elif kind < 0.92:
                 w = 0.24
-                g.rod((at + 0.12, 0, z), (at + 0.12, 0, z + 0.3), 0.11, rng.choice(("steel", "copper", mat)), 14)
+                g.rod(
+                    (at + 0.12, 0, z), (at + 0.12, 0, z + 0.3), 0.11, rng.choice(("steel", "copper", mat)), 14
+                )
                 g.rod((at + 0.12, 0, z + 0.3), (at + 0.12, 0, z + 0.34), 0.05, "dark", 8)
             at += w + rng.uniform(0.03, 0.2)
     g.object("shelf", (x, y, 0), yaw)
@@ -480,7 +517,10 @@ def crane(p: Place, y0: float, speed: float, x0: float, drift: float) -> None:
     for dx in (-0.06, 0.06):
         hook.rod((dx, 0, 0), (dx, 0, -length), 0.014, "steel", 6)
     hook.box((-0.12, -0.08, -length - 0.3), (0.12, 0.08, -length), "stripes")
-    curl = [(0.11 * math.sin(t), 0, -length - 0.42 - 0.11 * math.cos(t)) for t in (i * 0.35 - 2.4 for i in range(14))]
+    curl = [
+        (0.11 * math.sin(t), 0, -length - 0.42 - 0.11 * math.cos(t))
+        for t in (i * 0.35 - 2.4 for i in range(14))
+    ]
     hook.tube([(0, 0, -length - 0.3), *curl], 0.03, "steel", 8)
     for dx in (-0.5, 0.5):
         hook.rod((0, 0, -length - 0.5), (dx, 0, -length - 1.0), 0.012, "rubber", 6)
@@ -502,12 +542,20 @@ def robot(p: Place, x: float, y: float) -> None:
     base = p.part()
     base.rod((0, 0, 0), (0, 0, 0.35), 0.5, "dark", 20).rod((0, 0, 0.35), (0, 0, 0.42), 0.46, "stripes", 20)
     base.object("robot_base", (x, y, 0))
-    waist = p.part().rod((0, 0, 0), (0, 0, 0.5), 0.32, "orange", 18).rod((-0.3, 0, 0.6), (0.3, 0, 0.6), 0.2, "dark", 16)
+    waist = (
+        p.part()
+        .rod((0, 0, 0), (0, 0, 0.5), 0.32, "orange", 18)
+        .rod((-0.3, 0, 0.6), (0.3, 0, 0.6), 0.2, "dark", 16)
+    )
     waist = waist.object("robot_waist")
     upper = p.part().box((-0.14, -0.12, -0.1), (0.14, 0.12, 1.35), "orange").rod((-0.26, 0, 1.3), (0.26, 0, 1.3), 0.17, "dark", 16)  # fmt: skip
     upper.rod((0.2, 0.05, 0.1), (0.2, 0.05, 1.2), 0.035, "chrome", 8)
     upper = upper.object("robot_upper", parent=waist)
-    fore = p.part().box((-0.1, -0.1, 0), (0.1, 0.1, 0.95), "orange").rod((0, 0, 0.9), (0, 0, 1.15), 0.09, "steel", 12)
+    fore = (
+        p.part()
+        .box((-0.1, -0.1, 0), (0.1, 0.1, 0.95), "orange")
+        .rod((0, 0, 0.9), (0, 0, 1.15), 0.09, "steel", 12)
+    )
     fore.tube([(0.14, 0, 0.0), (0.2, 0, 0.4), (0.12, 0, 0.95)], 0.03, "rubber", 6)
     fore = fore.object("robot_fore", parent=upper)
     hand = p.part().box((-0.16, -0.05, 0), (0.16, 0.05, 0.08), "dark")
@@ -530,15 +578,21 @@ def pump(p: Place, x: float, y: float, rate: float) -> None:
     bed.rod((0.35, 0, 0.85), (1.15, 0, 0.85), 0.26, "teal", 18)
     for at in (0.38, 1.1):
         bed.rod((at, 0, 0.85), (at + 0.08, 0, 0.85), 0.32, "steel", 18)
-    bed.rod((0.75, 0, 1.05), (0.75, 0, 1.6), 0.09, "brass", 12).box((0.5, -0.25, 0.42), (1.0, 0.25, 0.65), "dark")
-    bed.box((-0.98, -0.34, 0.42), (-0.82, -0.22, 0.92), "red").box((-0.98, 0.22, 0.42), (-0.82, 0.34, 0.92), "red")
+    bed.rod((0.75, 0, 1.05), (0.75, 0, 1.6), 0.09, "brass", 12).box(
+        (0.5, -0.25, 0.42), (1.0, 0.25, 0.65), "dark"
+    )
+    bed.box((-0.98, -0.34, 0.42), (-0.82, -0.22, 0.92), "red").box(
+        (-0.98, 0.22, 0.42), (-0.82, 0.34, 0.92), "red"
+    )
     bed.rod((-0.9, -0.55, 0.85), (-0.9, 0.4, 0.85), 0.05, "chrome", 10)
     bed.object("pump_bed", (x, y, 0))
     wheel = p.part().ring((0, 0, 0), "Y", 0.60, 0.065, "red", 28, 8)
     for i in range(6):
         t = math.tau * i / 6
         wheel.rod((0, 0, 0), (0.58 * math.cos(t), 0, 0.58 * math.sin(t)), 0.032, "red", 6)
-    wheel.rod((0, -0.07, 0), (0, 0.07, 0), 0.11, "dark", 14).rod((0.26, 0, 0), (0.26, 0.36, 0), 0.04, "chrome", 8)
+    wheel.rod((0, -0.07, 0), (0, 0.07, 0), 0.11, "dark", 14).rod(
+        (0.26, 0, 0), (0.26, 0.36, 0), 0.04, "chrome", 8
+    )
     phase, crank, link = p.rng.uniform(0, 6), 0.26, 0.95
     angle = lambda f: phase + rate * f  # noqa: E731
     hub = Vector((x - 0.9, y - 0.5, 0.85))
@@ -550,7 +604,8 @@ def pump(p: Place, x: float, y: float, rate: float) -> None:
         rod.object("connecting_rod"),
         p.frames,
         lambda f: co.place(
-            hub + Vector((crank * math.cos(angle(f)), 0.2, -crank * math.sin(angle(f)))), (0, -tilt(f) * -1 * -1, 0)
+            hub + Vector((crank * math.cos(angle(f)), 0.2, -crank * math.sin(angle(f)))),
+            (0, -tilt(f) * -1 * -1, 0),
         ),
     )
     piston = p.part().rod((0, 0.0, 0), (0.75, 0.0, 0), 0.055, "chrome", 12)
@@ -587,7 +642,9 @@ def tank(p: Place, x: float, y: float, radius: float, height: float, mat: str) -
     for s in (-0.18, 0.18):
         g.rod((s, -radius - 0.12, 0.2), (s, -radius - 0.12, height), 0.018, "yellow", 6)
     for i in range(int(height / 0.3)):
-        g.rod((-0.18, -radius - 0.12, 0.3 + 0.3 * i), (0.18, -radius - 0.12, 0.3 + 0.3 * i), 0.014, "yellow", 6)
+        g.rod(
+            (-0.18, -radius - 0.12, 0.3 + 0.3 * i), (0.18, -radius - 0.12, 0.3 + 0.3 * i), 0.014, "yellow", 6
+        )
     g.object("tank", (x, y, 0), p.rng.uniform(-0.6, 0.6))
 
 
@@ -667,11 +724,13 @@ def corridor(p: Place, colors: list[tuple], lit: bool) -> None:
             panel(p, -side * 1.9, y, face)
         elif kind == "sign":
             text = rng.choice((f"SECTOR {number:02d}", "DANGER", "EXIT >", "LEVEL -3", "NO ENTRY"))
-            sign(text, 0.42, p.mats[rng.choice(("white", "yellow", "red"))], (-side * 1.885, y, 1.75),
+            sign(text, 0.42, p.mats[rng.choice(("dark", "yellow", "red"))], (-side * 1.885, y, 1.75),
                  (math.pi / 2, 0, math.pi / 2 * side))  # fmt: skip
         for dy in (-0.7, 0.9):
             if kind in ("crates", "sign") and p.free(-side * 1.45, y + dy, 0.32, 0.55):
-                barrel(p, -side * 1.45, y + dy) if rng.random() < 0.6 else crate(p, -side * 1.45, y + dy, 0.6, 0)
+                barrel(p, -side * 1.45, y + dy) if rng.random() < 0.6 else crate(
+                    p, -side * 1.45, y + dy, 0.6, 0
+                )
         number += 1
         y += rng.uniform(1.7, 2.5)
     rib = p.part()
@@ -702,7 +761,9 @@ def corridor(p: Place, colors: list[tuple], lit: bool) -> None:
         tube_lamp(p, x, -22.2, 3.28, 0, rng.uniform(120, 170))
     near = p.path[0]
     ahead = near.y + rng.uniform(3.2, 4.2) if near.y > -20 else -17.5
-    flicker_lamp(p, (-side * 0.9, min(ahead, -1.0), 2.55), (side * 1.9, min(ahead, -1.0) + 0.3, 1.5), 120, colors)
+    flicker_lamp(
+        p, (-side * 0.9, min(ahead, -1.0), 2.55), (side * 1.9, min(ahead, -1.0) + 0.3, 1.5), 120, colors
+    )
 
 
 def hall(p: Place, colors: list[tuple], lit: str) -> None:
@@ -717,8 +778,14 @@ def hall(p: Place, colors: list[tuple], lit: str) -> None:
     columns.object("columns")
     for i, y in enumerate((4, 10, 16, 22)):
         for x, way in ((-4.9, 1), (4.3, -1)):
-            sign(f"{'A' if x < 0 else 'B'}{i + 1}", 0.5, p.mats["white"], (x + way * 0.31, y, 1.75), (math.pi / 2, 0, way * math.pi / 2))  # fmt: skip
-            sign(f"{'A' if x < 0 else 'B'}{i + 1}", 0.5, p.mats["white"], (x, y - 0.31, 1.75), (math.pi / 2, 0, 0))
+            sign(f"{'A' if x < 0 else 'B'}{i + 1}", 0.5, p.mats["dark"], (x + way * 0.31, y, 1.75), (math.pi / 2, 0, way * math.pi / 2))  # fmt: skip
+            sign(
+                f"{'A' if x < 0 else 'B'}{i + 1}",
+                0.5,
+                p.mats["dark"],
+                (x, y - 0.31, 1.75),
+                (math.pi / 2, 0, 0),
+            )
     crane(p, p.path[0].y + rng.uniform(3, 6) * (1 if p.path[-1].y >= p.path[0].y else -1) if p.path[0].x > -8 else 12,
           rng.choice((-1, 1)) * rng.uniform(0.03, 0.06), rng.uniform(-2.5, 0.5), rng.uniform(-0.04, 0.04))  # fmt: skip
     for x, y in ((-2.9, 7.2), (-3.0, 18.6)):
@@ -768,7 +835,7 @@ def hall(p: Place, colors: list[tuple], lit: str) -> None:
     clutter(p, -1.6, 2.4, 1.0, 25.0, 10)
     fan(p, (0, 26.1, 4.6), "Y", 1.35, rng.choice((-1, 1)) * rng.uniform(0.08, 0.13))
     for text, x, z in (("HALL 3", 4.6, 4.6), ("MAX 12 T", -4.6, 5.0)):
-        sign(text, 0.8, p.mats["white"], (x, 25.98, z), (math.pi / 2, 0, 0))
+        sign(text, 0.8, p.mats["red"], (x, 25.98, z), (math.pi / 2, 0, 0))
         sign(text, 0.8, p.mats["yellow"], (x, 0.32, z), (math.pi / 2, 0, math.pi))
     if not lit:
         return
@@ -778,7 +845,7 @@ def hall(p: Place, colors: list[tuple], lit: str) -> None:
     back = co.lamp((0.5, 29.0, 8.5), (1.0, 0.86, 0.62), 5200, 0.0, 60.0, (0, 20.0, 0.5))
     back.data.spot_blend = 0.2
     for x, y in ((-1.0, 3.2), (0.8, 9.4), (-1.0, 15.6), (0.8, 21.8)):
-        cage_lamp(p, (x, y, 6.0), (0, 0, -1), rng.uniform(600, 760), cone=96)
+        cage_lamp(p, (x, y, 6.0), (0, 0, -1), rng.uniform(950, 1200), cone=96)
     near = p.path[len(p.path) // 2]
     y = min(max(near.y + (4 if p.path[-1].y > p.path[0].y else -4), 2), 24)
     y = y if not 7.5 < y < 16.5 else (6.2 if y < 12 else 17.5)
@@ -843,6 +910,8 @@ def build(*, seed: int, split: str, clip: int, frames: int) -> None:
     place = Place(library(), rng, [matrix.translation for matrix in matrices], frames)
     shell(place)
     corridor(place, colors, lit=kind in ("corridor", "turn"))
-    hall(place, colors, lit={"corridor": "door", "hall": "all", "gallery": "all", "store": "all"}.get(kind, ""))
+    hall(
+        place, colors, lit={"corridor": "door", "hall": "all", "gallery": "all", "store": "all"}.get(kind, "")
+    )
     pumps(place, colors, lit=kind == "pumps")
     bpy.context.view_layer.update()

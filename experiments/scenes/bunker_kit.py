@@ -18,8 +18,8 @@ import common as co
 
 Point = Sequence[float]
 
-AMBIENT_UP = (0.24, 0.30, 0.36)
-AMBIENT_DOWN = (0.20, 0.17, 0.14)
+AMBIENT_UP = (0.18, 0.225, 0.27)
+AMBIENT_DOWN = (0.16, 0.135, 0.11)
 
 
 # --- materials ------------------------------------------------------------------------------------------
@@ -35,7 +35,11 @@ def ambient_group() -> bpy.types.NodeTree:
     tree.interface.new_socket("Light", in_out="OUTPUT", socket_type="NodeSocketColor")
     new, link = tree.nodes.new, tree.links.new
     source, sink = new("NodeGroupInput"), new("NodeGroupOutput")
-    geometry, axes, height = new("ShaderNodeNewGeometry"), new("ShaderNodeSeparateXYZ"), new("ShaderNodeMapRange")
+    geometry, axes, height = (
+        new("ShaderNodeNewGeometry"),
+        new("ShaderNodeSeparateXYZ"),
+        new("ShaderNodeMapRange"),
+    )
     height.inputs["From Min"].default_value = -1.0
     link(geometry.outputs["Normal"], axes.inputs[0])
     link(axes.outputs["Z"], height.inputs["Value"])
@@ -135,9 +139,14 @@ def paint(
     at = n.coordinates()
     chip = n.noise(at, 5.0, 4.0, 0.65)
     shade = n.step(n.noise(at, 1.7, 2.0), 0.3, 0.7, 0.75, 1.1)
-    full = n.mix(1.0, color, n.node("ShaderNodeCombineColor", {0: shade, 1: shade, 2: shade}).outputs[0], "MULTIPLY")
+    full = n.mix(
+        1.0, color, n.node("ShaderNodeCombineColor", {0: shade, 1: shade, 2: shade}).outputs[0], "MULTIPLY"
+    )
     worn = n.math("LESS_THAN", chip, wear)
-    n.set("Roughness", n.math("MAXIMUM", n.step(chip, 0.35, 0.65, rough[1], rough[0]), n.math("MULTIPLY", worn, 0.7)))
+    n.set(
+        "Roughness",
+        n.math("MAXIMUM", n.step(chip, 0.35, 0.65, rough[1], rough[0]), n.math("MULTIPLY", worn, 0.7)),
+    )
     finish(n, n.mix(worn, full, under))
     return mat
 
@@ -157,7 +166,9 @@ def metal(name: str, color: co.Color, rough: tuple[float, float], rust: float = 
     return mat
 
 
-def plates(name: str, color: co.Color, size: float, rough: tuple[float, float], metallic: float) -> bpy.types.Material:
+def plates(
+    name: str, color: co.Color, size: float, rough: tuple[float, float], metallic: float
+) -> bpy.types.Material:
     """Riveted or galvanised plates: a tone a cell (Voronoi) and dark seams."""
     mat, n = _new(name)
     uv = n.coordinates("UV")
@@ -174,7 +185,9 @@ def plates(name: str, color: co.Color, size: float, rough: tuple[float, float], 
     return mat
 
 
-def stripes(name: str, a: co.Color = (0.75, 0.52, 0.03), b: co.Color = (0.025, 0.025, 0.025)) -> bpy.types.Material:
+def stripes(
+    name: str, a: co.Color = (0.75, 0.52, 0.03), b: co.Color = (0.025, 0.025, 0.025)
+) -> bpy.types.Material:
     """Diagonal warning stripes, 0.16 m wide, worn."""
     mat, n = _new(name)
     uv = n.coordinates("UV")
@@ -243,9 +256,13 @@ def library() -> dict[str, bpy.types.Material]:
     ambient_group()
     mats = {
         "wall": concrete("wall", (0.40, 0.39, 0.365), (2.4, 1.3), band=(0.045, 0.20, 0.20)),
-        "hallwall": concrete("hallwall", (0.36, 0.365, 0.36), (3.0, 1.6), band=(0.28, 0.075, 0.045), stain=0.75),
+        "hallwall": concrete(
+            "hallwall", (0.36, 0.365, 0.36), (3.0, 1.6), band=(0.28, 0.075, 0.045), stain=0.75
+        ),
         "ceiling": concrete("ceiling", (0.30, 0.30, 0.295), (2.4, 1.2), stain=0.4),
-        "floor": concrete("floor", (0.30, 0.285, 0.265), (2.0, 2.0), stain=0.35, rough=(0.20, 0.62), wet=0.55),
+        "floor": concrete(
+            "floor", (0.30, 0.285, 0.265), (2.0, 2.0), stain=0.35, rough=(0.20, 0.62), wet=0.55
+        ),
         "pit": concrete("pit", (0.16, 0.15, 0.14), (1.2, 0.6), stain=0.6),
         "column": concrete("column", (0.45, 0.44, 0.41), (1.1, 1.4), stain=0.8),
         "steel": metal("steel", (0.58, 0.58, 0.60), (0.20, 0.40)),
@@ -293,7 +310,13 @@ class Part:
         self.faces: list[tuple[tuple[int, ...], int, bool]] = []
         self.uvs: list[tuple[float, float]] = []
 
-    def face(self, corners: Sequence[Point], mat: str, uv: Sequence[tuple[float, float]] | None = None, smooth=False):
+    def face(
+        self,
+        corners: Sequence[Point],
+        mat: str,
+        uv: Sequence[tuple[float, float]] | None = None,
+        smooth=False,
+    ):
         """One polygon, counter-clockwise seen from outside; planar UVs by its dominant axis unless given."""
         if mat not in self.names:
             self.names.append(mat)
@@ -324,11 +347,15 @@ class Part:
         """Box by centre and size, turned about the vertical."""
         half = Vector(size) / 2
         turn = Matrix.Translation(Vector(centre)) @ Matrix.Rotation(yaw, 4, "Z")
-        return self.box(-half, half, mat, None if yaw == 0 else turn) if yaw else self.box(
-            Vector(centre) - half, Vector(centre) + half, mat
+        return (
+            self.box(-half, half, mat, None if yaw == 0 else turn)
+            if yaw
+            else self.box(Vector(centre) - half, Vector(centre) + half, mat)
         )
 
-    def tube(self, points: Sequence[Point], radius: float | Sequence[float], mat: str, sides=12, caps=True) -> "Part":
+    def tube(
+        self, points: Sequence[Point], radius: float | Sequence[float], mat: str, sides=12, caps=True
+    ) -> "Part":
         """Round tube through `points` (one radius, or one a point)."""
         centres = [Vector(point) for point in points]
         radii = [radius] * len(centres) if isinstance(radius, int | float) else list(radius)
@@ -342,7 +369,9 @@ class Part:
             length += (centre - behind).length
             lengths.append(length)
             angles = [math.tau * k / sides for k in range(sides + 1)]
-            rings.append([centre + turn @ Vector((radii[i] * math.cos(t), radii[i] * math.sin(t), 0)) for t in angles])
+            rings.append(
+                [centre + turn @ Vector((radii[i] * math.cos(t), radii[i] * math.sin(t), 0)) for t in angles]
+            )
         widest = max(radii)
         for i in range(len(rings) - 1):
             for k in range(sides):
@@ -361,13 +390,17 @@ class Part:
         """Straight tube."""
         return self.tube((a, b), radius, mat, sides)
 
-    def ring(self, centre: Point, axis: str, radius: float, thick: float, mat: str, steps=20, sides=8) -> "Part":
+    def ring(
+        self, centre: Point, axis: str, radius: float, thick: float, mat: str, steps=20, sides=8
+    ) -> "Part":
         """Torus about the axis "X", "Y" or "Z" (a hand wheel, a hoop)."""
         u, v = {"X": ((0, 1, 0), (0, 0, 1)), "Y": ((1, 0, 0), (0, 0, 1)), "Z": ((1, 0, 0), (0, 1, 0))}[axis]
         at = lambda t: Vector(centre) + radius * (math.cos(t) * Vector(u) + math.sin(t) * Vector(v))  # noqa: E731
         return self.tube([at(math.tau * i / steps) for i in range(steps + 1)], thick, mat, sides, caps=False)
 
-    def object(self, name: str, location: Point = (0, 0, 0), yaw: float = 0.0, parent=None) -> bpy.types.Object:
+    def object(
+        self, name: str, location: Point = (0, 0, 0), yaw: float = 0.0, parent=None
+    ) -> bpy.types.Object:
         """Make the object. Vertices at equal places are merged, so that smooth faces share normals."""
         return co.add(self.data(name), name, location, (0, 0, yaw), parent=parent)
 
@@ -408,12 +441,15 @@ def bend(points: Sequence[Point], radius: float, steps: int = 5) -> list[Vector]
         start = b + (a - b).normalized() * radius
         end = b + (c - b).normalized() * radius
         path += [
-            start * (1 - t) ** 2 + b * (2 * t * (1 - t)) + end * t**2 for t in (i / steps for i in range(steps + 1))
+            start * (1 - t) ** 2 + b * (2 * t * (1 - t)) + end * t**2
+            for t in (i / steps for i in range(steps + 1))
         ]
     return [*path, Vector(points[-1])]
 
 
-def sign(text: str, size: float, mat: bpy.types.Material, location: Point, rotation: Point) -> bpy.types.Object:
+def sign(
+    text: str, size: float, mat: bpy.types.Material, location: Point, rotation: Point
+) -> bpy.types.Object:
     """Painted letters as a flat mesh."""
     curve = bpy.data.curves.new("sign", "FONT")
     curve.body, curve.size, curve.align_x, curve.align_y = text, size, "CENTER", "CENTER"
