@@ -31,7 +31,7 @@ from docks_town import add_coil, add_goods, add_lamp, add_quay, add_stall, add_t
 
 SETTINGS = {
     "test_samples": 64,
-    "train_samples": 16,
+    "train_samples": 20,
     "denoise": False,
     "max_bounces": 3,
     "diffuse_bounces": 0,
