@@ -283,7 +283,7 @@ def sky(
 ) -> bpy.types.World:
     """World with a vertical gradient: stops of (sine of the elevation in -1..1, linear RGB).
 
-    With `light`, the camera and reflections see the gradient and diffuse surfaces get the flat colour `light`.
+    With `light`, the camera and reflections see the gradient; diffuse surfaces get the colour `light`.
     """
     world = bpy.data.worlds.new("sky")
     bpy.context.scene.world = world

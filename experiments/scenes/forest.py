@@ -1,7 +1,8 @@
 """Forest: old trunks, ferns and a winding path under a canopy with sun patches that move with the branches.
 
-Each clip is a forest of its own, drawn from (seed, split, clip), with one of five camera moves. Swaying plants,
-lanterns, drifting leaves, birds and butterflies are rigid objects keyed on every frame 0..frames+1.
+Each clip is a forest of its own, drawn from (seed, split, clip), with one of five camera moves.
+Swaying plants, lanterns, drifting leaves, birds and butterflies
+are rigid objects keyed on every frame 0..frames+1.
 """
 
 import math
@@ -452,7 +453,7 @@ def add_ground(forest: Forest) -> None:
 
 def add_lanterns(forest: Forest, palette: random.Random) -> None:
     """Two posts beside the path with lanterns that swing about their hooks."""
-    rng, terrain, shot, frames = forest.rng, forest.terrain, forest.shot, forest.frames
+    rng, terrain, frames = forest.rng, forest.terrain, forest.frames
     wood = parts.plain_material("post wood", (0.16, 0.10, 0.06), 0.8)
     paper = parts.plain_material("paper", (0.5, 0.3, 0.12), 0.8, glow=(1.9, 0.85, 0.22))
     frame = parts.plain_material("lantern frame", (0.05, 0.035, 0.03), 0.4)
@@ -558,7 +559,7 @@ def add_flyers(forest: Forest, palette: random.Random) -> None:
         for side in (-1, 1):
             ob = common.add(wing, parent=holder)
 
-            def flap(f: int, side=side, phase=phase, pace=pace, spread=spread) -> Matrix:
+            def flap(f: int, side=side, phase=phase, pace=pace, spread=spread, bird=bird) -> Matrix:
                 angle = 0.15 + spread * math.sin(pace * f + phase)
                 root = Vector((side * 0.02, 0.03, 0.03 if bird else 0.01))
                 return (

@@ -1,9 +1,9 @@
 """Meshes and materials of the forest scene: bark, leaves, ferns, branches, rocks, birds, lanterns.
 
-Leaves are real geometry (no alpha). Every mesh carries a point attribute "shade": red varies the tint from leaf to
-leaf, green is the ambient occlusion that its author knows (0 in the heart of a plant, 1 at the tips).
-Sun light is Cycles'; most of the sky light is a noise-free hemisphere term in the emission input, and so is the
-haze that grows with view distance, so few samples give a clean truth.
+Leaves are real geometry (no alpha). Every mesh carries a point attribute "shade": red varies the tint from
+leaf to leaf, green is the ambient occlusion that its author knows (0 in the heart of a plant, 1 at the tips).
+Sun light is Cycles'; most of the sky light is a noise-free hemisphere term in the emission input,
+and so is the haze that grows with view distance, so few samples give a clean truth.
 """
 
 import math
@@ -148,7 +148,7 @@ def plain_material(name: str, color: common.Color, roughness: float = 0.6, glow:
     if glow is not None:
         nodes.set("Base Color", color)
         nodes.set("Emission Color", glow)
-        # A diffuse ray that hits the small lamp by chance would be a firefly: only the eye and the water see it.
+        # A diffuse ray that hits the small lamp by chance would be a firefly: only eye and water see it.
         rays = nodes.node("ShaderNodeLightPath").outputs
         nodes.set("Emission Strength", nodes.math("MAXIMUM", rays["Is Camera Ray"], rays["Is Glossy Ray"]))
         return mat
@@ -246,7 +246,7 @@ def fern(rng, mat, stem, fronds=11, pairs=13, reach=0.85) -> bpy.types.Mesh:
             rise = length * lift * (1.15 * t - 0.95 * t * t)
             spine.append(out * (length * (0.18 * t + 0.82 * t**1.4)) + Vector((0, 0, rise)))
         made.tube(
-            spine[::3] + [spine[-1]],
+            [*spine[::3], spine[-1]],
             [0.011 * (1 - 0.8 * i / (pairs // 3 + 1)) for i in range(len(spine[::3]) + 1)],
             4,
             0.2,
