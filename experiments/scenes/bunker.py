@@ -605,7 +605,7 @@ def pump(p: Place, x: float, y: float, rate: float) -> None:
         p.frames,
         lambda f: co.place(
             hub + Vector((crank * math.cos(angle(f)), 0.2, -crank * math.sin(angle(f)))),
-            (0, -tilt(f) * -1 * -1, 0),
+            (0, tilt(f), 0),
         ),
     )
     piston = p.part().rod((0, 0.0, 0), (0.75, 0.0, 0), 0.055, "chrome", 12)
