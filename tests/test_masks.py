@@ -200,7 +200,11 @@ def test_jit_and_batch():
     assert_jit_and_batch(ops.normal_mask, normal, warped)
     pairs = [_two_frames(t, (12, 8), ((0.1, 0.2), (-0.3, 0.4)), False)[1] for t in (2, 3)]
     stacked = jax.tree.map(lambda *x: jnp.stack(x), *pairs)
-    assert_jit_and_batch(ops.disocclusion_mask, *stacked)
+    assert_jit_and_batch(ops.disocclusion_mask, *stacked, eager=False)
+    depths, cameras = [b.depth_linear for b in stacked[:2]], stacked[2:4]
+    assert_jit_and_batch(
+        ops.position_mask, *depths, stacked[0].normal, stacked[0].motion_px, *cameras, eager=False
+    )
     low, high = (_f32(rng.uniform(0, 1, (3, 2, *s, 3))) for s in ((2, 3), (4, 6)))
     assert_jit_and_batch(ops.blend_mask, low[0], high[0], low[1], high[1], low[2], high[2])
 
