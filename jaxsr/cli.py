@@ -98,6 +98,8 @@ def inspect(
 ) -> None:
     """Look through a sequence: buffers, motion convention, jitter, and what each method lacks.
 
+    Exits with 1 if something is wrong with the sequence, 0 otherwise.
+
     Args:
         sequence: folder of the sequence.
         json: print the findings for machines instead of people.
@@ -114,6 +116,8 @@ def inspect(
         print(json_module.dumps(report.to_json(), indent=1))
     else:
         print_report(report)
+    if report.level == "bad":
+        raise SystemExit(1)
 
 
 @app.command
@@ -121,19 +125,31 @@ def compare(
     folders: Positional[tuple[Path, ...]],
     truth: Path,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("jaxsr-compare"),
-    exposure: float = 1.0,
-    fps: float = 24.0,
+    exposure: float | None = None,
+    fps: float = 4.0,
 ) -> None:
     """Measure folders of frames against the truth and write the comparison page.
 
     Args:
-        folders: frames of each method, PNG (as shown) or EXR (linear colour), matched by number.
-        truth: the true frames.
+        folders: one a method: PNG (as shown) or EXR (linear colour) frames, matched by number.
+        truth: the true frames; a sequence will do.
         out: folder for the page and the metrics.
-        exposure: factor on linear colour before the tone map.
-        fps: playing speed on the page.
+        exposure: factor on linear colour before the tone map; that of the truth, else 1.
+        fps: speed at which the page plays at first.
     """
-    raise NotImplementedError
+    from rich.console import Console
+
+    from jaxsr.evaluation.compare import compare as compare_folders
+    from jaxsr.evaluation.demo import description
+    from jaxsr.evaluation.tables import rich_tables
+
+    with _progress() as progress:
+        section = compare_folders(
+            folders, truth, out, exposure=exposure, fps=fps, meta=description(), progress=progress
+        )
+    for table in rich_tables([section]):
+        Console().print(table)
+    print(f"Open {out / 'report.html'}; metrics.json, .csv and .md are beside it.")
 
 
 @app.command
@@ -172,6 +188,92 @@ def upscale(
         f"{len(opened)} frames in {out}: {timing.median_ms:.1f} ms a frame, "
         f"compiled in {timing.compile_s:.1f} s"
     )
+
+
+@app.command
+def render(
+    scene: Positional[Path],
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])],
+    frames: Annotated[str | None, tyro.conf.arg(metavar="A:B")] = None,
+    scale: tuple[int, ...] = (4,),
+    size: tuple[int, int] | None = None,
+    samples: int | None = None,
+    denoise: bool | None = None,
+    position: bool = True,
+    seed: int = 0,
+    blender: Path | None = None,
+    threads: int | None = None,
+) -> None:
+    """Render a .blend to a sequence: colour and G-buffers, high-resolution and jittered low-resolution.
+
+    An interrupted render goes on where it stopped when it is run again.
+
+    Args:
+        scene: a .blend file.
+        out: folder of the sequence.
+        frames: first and last frame; all by default.
+        scale: one or more factors between high and low resolution; 1 renders high resolution only.
+        size: width and height; the scene's by default.
+        samples: of the colour; the scene's by default.
+        denoise: denoise the colour; the scene's choice by default.
+        position: store world positions too; without them they are rebuilt from depth and camera.
+        seed: of the renderer's noise.
+        blender: a Blender program, or a Python that has the bpy module; else JAXSR_BLENDER, else `blender`.
+        threads: of the renderer; all cores by default.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    from jaxsr.io.blender import Progress as RenderProgress
+    from jaxsr.io.blender import render as render_scene
+
+    bounds = _frame_range(frames)
+    columns = (
+        TextColumn("frames"),
+        BarColumn(),
+        TextColumn("{task.fields[count]}"),
+        TimeElapsedColumn(),
+        TextColumn("left"),
+        TimeRemainingColumn(),
+        TextColumn("{task.fields[message]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as bar:
+        task = bar.add_task("frames", total=None, message="starting Blender", count="")
+
+        def show(at: RenderProgress) -> None:
+            speed = bar.tasks[0].speed
+            rate = f"{60 * speed:.1f} frames/min" if speed else ""
+            bar.update(task, total=at.total_frames, completed=at.done_frames, message=at.message, rate=rate)
+
+        render_scene(
+            scene,
+            out,
+            bounds,
+            scale,
+            size=size,
+            samples=samples,
+            denoise=denoise,
+            position=position,
+            seed=seed,
+            blender=blender,
+            threads=threads,
+            progress=show,
+        )
+    print(f"{out}: look through it with `jaxsr inspect {out}`")
+
+
+def _frame_range(text: str | None) -> tuple[int, int] | None:
+    """ "a:b" as two frame numbers; one number alone is that frame."""
+    if text is None:
+        return None
+    ends = text.split(":")
+    try:
+        first, last = int(ends[0]), int(ends[-1])
+    except ValueError:
+        first, last = 1, 0
+    if len(ends) > 2 or last < first:
+        raise JaxsrError("bad range of frames", where="--frames", expected="a:b with a <= b", found=text)
+    return first, last
 
 
 def main(arguments: list[str] | None = None) -> None:

@@ -1,7 +1,6 @@
 """`jaxsr demo`: the sample that ships with the package, upscaled and extrapolated, measured and shown."""
 
 import importlib.resources
-import json
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -14,10 +13,9 @@ import numpy as np
 import jaxsr
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.report import write_report
-from jaxsr.evaluation.tables import Section, as_json, markdown
+from jaxsr.evaluation.tables import Section, write_metrics
 from jaxsr.evaluation.upscale import run_section
 from jaxsr.evaluation.video import write_video
-from jaxsr.io.exr import atomic_path
 from jaxsr.io.sequence import Sequence as FrameSequence
 
 UPSCALERS = ("nearest", "bilinear", "bicubic", "taau")
@@ -78,7 +76,9 @@ def run_demo(
         for task, every, methods in tasks:
             folder = out / sequence.name / task
             sections.append(run_section(sequence, methods, folder, scale=scale, every=every, advance=advance))
-    write_results(out, sections, title="jaxsr demo", meta=description(scale=scale))
+    meta = description(scale=scale)
+    write_report(out / "report.html", sections, title="jaxsr demo", meta=meta)
+    write_metrics(out, sections, title="jaxsr demo", meta=meta)
     advance = progress("videos", len(sections))
     fps = opened[0].fps / 3  # slow motion: the sample is short
     for section, (sequence, (task, _, _)) in zip(
@@ -90,15 +90,6 @@ def run_demo(
         write_video(out / f"{sequence.name}-{task}.mp4", columns, fps=fps)
         advance()
     return sections
-
-
-def write_results(out: Path, sections: Sequence[Section], *, title: str, meta: dict[str, Any]) -> None:
-    """Write `report.html`, `metrics.json` and `metrics.md`."""
-    write_report(out / "report.html", sections, title=title, meta=meta)
-    with atomic_path(out / "metrics.json") as temporary:
-        temporary.write_text(json.dumps(as_json(sections, title=title, meta=meta), indent=1) + "\n")
-    with atomic_path(out / "metrics.md") as temporary:
-        temporary.write_text(markdown(sections) + "\n")
 
 
 def _enlarged(section: Section) -> list[np.ndarray]:

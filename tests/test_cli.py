@@ -1,0 +1,220 @@
+"""The command line: what it prints, what it exits with, and one clear line for every bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+import jaxsr.cli
+from jaxsr.io.exr import read_exr, write_exr
+from jaxsr.io.images import write_png
+from tests.builders import make_sequence
+
+
+def run(capsys, *arguments) -> tuple[int, str, str]:
+    try:
+        jaxsr.cli.main([str(a) for a in arguments])
+        status = 0
+    except SystemExit as stop:
+        status = stop.code if isinstance(stop.code, int) else 1
+    out, err = capsys.readouterr()
+    return status, out, err
+
+
+def error_line(capsys, *arguments) -> str:
+    """The only line of an error, which begins with the name of the program; no traceback, status 2."""
+    status, _, err = run(capsys, *arguments)
+    lines = [line for line in err.splitlines() if line.startswith("jaxsr: ")]
+    assert status == 2
+    assert len(lines) == 1
+    assert "Traceback" not in err
+    return lines[0]
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    return make_sequence(tmp_path / "seq", frames=3)
+
+
+def test_help_answers_without_loading_jax():
+    import subprocess
+    import sys
+
+    code = "import jaxsr.cli, sys\ntry: jaxsr.cli.main(['--help'])\nexcept SystemExit: pass\n" + (
+        "assert 'jax' not in sys.modules, 'jax was imported'"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    for verb in ("demo", "inspect", "compare", "upscale", "render"):
+        assert verb in done.stdout
+
+
+def test_inspect_prints_and_speaks_json(capsys, sequence):
+    status, out, _ = run(capsys, "inspect", sequence.path)
+    assert status == 0
+    assert "motion" in out
+    status, out, _ = run(capsys, "inspect", sequence.path, "--json")
+    assert status == 0
+    assert json.loads(out)["name"] == "seq"
+
+
+def test_upscale_writes_frames(capsys, sequence, tmp_path):
+    status, out, _ = run(capsys, "upscale", sequence.path, "--method", "bilinear", "--out", tmp_path / "out")
+    assert status == 0
+    assert "3 frames" in out
+    assert len(list((tmp_path / "out" / "png").iterdir())) == 3
+
+
+def test_compare_writes_a_page(capsys, sequence, tmp_path):
+    run(capsys, "upscale", sequence.path, "--method", "nearest", "--out", tmp_path / "a")
+    run(capsys, "upscale", sequence.path, "--method", "bilinear", "--out", tmp_path / "b")
+    out = tmp_path / "cmp"
+    status, text, _ = run(
+        capsys, "compare", tmp_path / "a", tmp_path / "b", "--truth", sequence.path, "-o", out
+    )
+    assert status == 0
+    assert "PSNR" in text
+    assert (out / "report.html").is_file()
+
+
+@pytest.mark.parametrize("verb", ["inspect", "upscale"])
+class TestSequenceCommands:
+    """Commands that read a sequence."""
+
+    def test_missing(self, capsys, tmp_path, verb):
+        assert "no such folder" in error_line(capsys, verb, tmp_path / "nothing")
+
+    def test_not_a_sequence(self, capsys, tmp_path, verb):
+        (tmp_path / "empty").mkdir()
+        assert "sequence.json" in error_line(capsys, verb, tmp_path / "empty")
+
+    def test_mismatched_count(self, capsys, sequence, verb):
+        (sequence.path / "x2" / "0002.exr").unlink()
+        assert "0002.exr" in error_line(capsys, verb, sequence.path)
+
+
+def rewrite(file, change):
+    """Let `change` edit the channels of an OpenEXR file: what no writer of ours would write."""
+    channels, metadata = read_exr(file)
+    channels = dict(channels)
+    change(channels)
+    write_exr(file, channels, metadata)
+
+
+def test_upscale_truncated(capsys, sequence, tmp_path):
+    file = sequence.path / "x2" / "0002.exr"
+    file.write_bytes(file.read_bytes()[:-400])
+    line = error_line(capsys, "upscale", sequence.path, "-o", tmp_path / "out", "--method", "nearest")
+    assert "0002.exr" in line
+    assert not list((tmp_path / "out").rglob("0002.*"))
+
+
+def test_upscale_missing_channel(capsys, sequence, tmp_path):
+    rewrite(sequence.path / "hr" / "0002.exr", lambda channels: channels.pop("motion.Y"))
+    line = error_line(capsys, "upscale", sequence.path, "-o", tmp_path / "out")
+    assert "motion" in line
+    assert "0002" in line
+
+
+def test_upscale_wrong_size(capsys, sequence, tmp_path):
+    other = make_sequence(tmp_path / "other", frames=3, size=(32, 20))
+    (other.path / "x2" / "0002.exr").replace(sequence.path / "x2" / "0002.exr")
+    line = error_line(capsys, "upscale", sequence.path, "-o", tmp_path / "out", "--method", "nearest")
+    assert "0002.exr" in line
+    assert "size" in line
+
+
+def test_upscale_nan(capsys, sequence, tmp_path):
+    def spoil(channels):
+        channels["color.G"] = channels["color.G"].copy()
+        channels["color.G"][3, 4] = np.nan
+
+    rewrite(sequence.path / "x2" / "0002.exr", spoil)
+    line = error_line(capsys, "upscale", sequence.path, "-o", tmp_path / "out", "--method", "nearest")
+    assert "NaN" in line
+    assert "0002.exr" in line
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--method", "magic"], "one of nearest"),
+        (["--scale", "3"], "scale 3 is not available"),
+        (["--every", "0"], "every"),
+    ],
+)
+def test_upscale_arguments(capsys, sequence, tmp_path, arguments, expected):
+    assert expected in error_line(capsys, "upscale", sequence.path, "-o", tmp_path / "out", *arguments)
+    assert not list((tmp_path / "out").rglob("*.exr"))
+
+
+def test_inspect_finds_what_is_wrong_with_the_pixels(capsys, sequence):
+    """Faults of the pixels are findings: all of them are listed, and the status is 1."""
+    for file in (sequence.path / "hr").iterdir():
+        rewrite(file, lambda channels: channels.update({"normal.X": channels["normal.X"] * np.nan}))
+    status, out, _ = run(capsys, "inspect", sequence.path, "--json")
+    assert status == 1
+    assert any("NaN" in finding["text"] for finding in json.loads(out)["findings"])
+
+
+def test_inspect_flipped_motion(capsys, tmp_path):
+    def flip(resolution, index, layers):
+        layers["motion"] = -layers["motion"]
+
+    seq = make_sequence(tmp_path / "s", frames=3, size=(96, 54), spoil=flip)
+    status, out, _ = run(capsys, "inspect", seq.path)
+    assert status == 1
+    assert "forward" in out or "flipped" in out
+
+
+def test_inspect_zero_motion(capsys, tmp_path):
+    seq = make_sequence(
+        tmp_path / "s", frames=3, spoil=lambda r, i, layers: layers.update(motion=0 * layers["motion"])
+    )
+    _, out, _ = run(capsys, "inspect", seq.path)
+    assert "zero" in out.lower() or "nothing moves" in out.lower()
+
+
+def test_compare_errors(capsys, sequence, tmp_path):
+    def frames(name, count, size=(24, 16)):
+        for i in range(count):
+            write_png(tmp_path / name / f"{i:04d}.png", np.full((size[1], size[0], 3), 0.5, np.float32))
+        return tmp_path / name
+
+    truth, good = frames("truth", 3), frames("good", 3)
+    arguments = ("--truth", truth, "-o", tmp_path / "cmp")
+    assert "no such folder" in error_line(capsys, "compare", tmp_path / "none", *arguments)
+    assert "no folders" in error_line(capsys, "compare", *arguments)
+    short = frames("short", 2)
+    assert "expected 3 frames; found 2 frames" in error_line(capsys, "compare", good, short, *arguments)
+    small = frames("small", 3, (12, 8))
+    assert "small" in error_line(capsys, "compare", small, *arguments)
+    broken = frames("broken", 3)
+    data = (broken / "0001.png").read_bytes()
+    (broken / "0001.png").write_bytes(data[: len(data) // 2])
+    assert "0001.png" in error_line(capsys, "compare", broken, *arguments)
+    (tmp_path / "bare").mkdir()
+    assert "no frames" in error_line(capsys, "compare", tmp_path / "bare", *arguments)
+    assert not (tmp_path / "cmp" / "report.html").exists()
+
+
+def test_render_errors(capsys, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    assert "not a scene" in error_line(capsys, "render", tmp_path / "none.blend", "-o", out)
+    (tmp_path / "a.txt").write_text("x")
+    assert "not a scene" in error_line(capsys, "render", tmp_path / "a.txt", "-o", out)
+    scene = tmp_path / "a.blend"
+    scene.write_bytes(b"BLENDER-v500")
+    assert "range" in error_line(capsys, "render", scene, "-o", out, "--frames", "5:2")
+    assert "range" in error_line(capsys, "render", scene, "-o", out, "--frames", "x")
+    line = error_line(capsys, "render", scene, "-o", out, "--blender", tmp_path / "no-blender")
+    assert "no-blender" in line
+    assert not out.exists()
+
+
+def test_demo_errors(capsys, tmp_path, monkeypatch):
+    assert "no scene 'moon'" in error_line(capsys, "demo", "-o", tmp_path, "--scenes", "moon")
+    assert "scale 3 is not available" in error_line(capsys, "demo", "-o", tmp_path / "d", "--scale", "3")
+    monkeypatch.setattr("jaxsr.evaluation.demo.sample_folder", lambda: tmp_path / "none")
+    assert "sample is missing" in error_line(capsys, "demo", "-o", tmp_path / "d")
+    assert not (tmp_path / "d").exists()
