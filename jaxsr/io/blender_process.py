@@ -94,6 +94,7 @@ class BlenderProcess:
         self.job.write_text(json.dumps(job))
 
     def __enter__(self) -> "BlenderProcess":
+        self.log.parent.mkdir(parents=True, exist_ok=True)
         self._log = self.log.open("wb")
         try:
             self._process = subprocess.Popen(
