@@ -191,6 +191,12 @@ def build(*, seed: int, split: str, clip: int, frames: int) -> None:
     scene.collection.objects.link(camera)
     animate(camera, camera_pose)
     scene.camera = camera
+    if split == "zoom":
+        camera.animation_data_clear()
+        camera.location, camera.rotation_euler = camera_pose(0)
+        for frame in range(frames + 2):
+            camera.data.lens = 30 + 3 * frame
+            camera.data.keyframe_insert("lens", frame=frame)
     if split == "orthographic":
         camera.data.type = "ORTHO"
     if split == "cut":

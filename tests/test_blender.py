@@ -414,6 +414,35 @@ def test_cameras_bound_to_markers_cut(tmp_path, program):
 
 
 @pytest.mark.blender
+def test_motion_of_a_zoom(tmp_path, program):
+    """The focal length changes and the camera stands: all scales about the optical axis."""
+    seq = Sequence.open(render_scene(tmp_path / "seq", program, (2, 2), "zoom", scales=(2,)))
+    info, lr = seq.infos[0], seq.frame(0, 2).lr
+    h, w = lr.depth_linear.shape[:2]
+    p = pixels(h, w, info.jitter_px)
+    ndc = (p + 0.5) / (w, h) * 2 - 1
+    before = (ndc + info.lens_shift) * (33 / 36) - info.lens_shift
+    still = (lr.object_id[..., 0] == PLANE) | (lr.object_id[..., 0] == 0)
+    error = np.abs(lr.motion_px - (p - ((before + 1) / 2 * (w, h) - 0.5)))
+    assert np.abs(lr.motion_px).max() > 1
+    assert error[still].max() < 1e-3
+
+
+@pytest.mark.blender
+def test_blender_executable_takes_the_same_job(rendered, tmp_path, program):
+    """The command line of `blender -b --python`, spoken to a stand-in that hands it to a Python with bpy."""
+    if not find_blender(program).is_python:
+        pytest.skip("the other tests already run a Blender executable")
+    folder = tmp_path / "bin"
+    folder.mkdir()
+    check = '[ "$1 $2 $3 $4 $5" = "-b --factory-startup --python-exit-code 1 --python" ] || exit 9'
+    shim = fake_blender(folder, f'{check}\nshift 5\nexec "{program}" "$@"')
+    out = render_scene(tmp_path / "seq", str(shim), (1, 1))
+    name = "hr/0001.exr"
+    assert contents(out)[name] == contents(rendered.path)[name]
+
+
+@pytest.mark.blender
 def test_job_errors(tmp_path, program):
     with pytest.raises(JaxsrError, match=r"not divisible by scale 4.*64x38.*--size 64 36"):
         render_scene(tmp_path / "a", program, size=(64, 38))
