@@ -91,7 +91,7 @@
   function shown(src) {
     const f = state.frame, index = src.images[f], truth = section().truth[f];
     if (!section().embedded[f]) return { text: "this frame's images are not in the page" };
-    if (index == null) return { text: "not rendered: this frame is extrapolated" };
+    if (index == null && state.view !== "diff") return { text: "not rendered: this frame is extrapolated" };
     const wait = (x) => (x ? { image: x } : { text: "" });
     if (state.view === "error") return wait(difference(index, truth));
     if (state.view === "diff") {
@@ -147,7 +147,7 @@
     g.imageSmoothingEnabled = z < 1;
     g.imageSmoothingQuality = "high";
     let complete = true;
-    for (const [key, from, to] of [[state.left, 0, cut], [state.right, cut, W]]) {
+    for (const [key, from, to] of state.view === "diff" ? [[state.right, 0, W]] : [[state.left, 0, cut], [state.right, cut, W]]) {
       const { image, text } = shown(source(key));
       g.save();
       g.beginPath(); g.rect(from, 0, to - from, H); g.clip();

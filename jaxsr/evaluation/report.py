@@ -149,16 +149,21 @@ def _embed(payload: list[dict[str, Any]], images: Images, budget: float) -> tupl
     """
     flips = sum(len(file) for s in payload for t in s["tracks"] for file in t["flip"]) * 4 / 3
     name, size = images.choose(max(budget - flips, budget / 2))
-    every = math.ceil((size + flips) / budget)
+    total = sum(len(s["frames"]) for s in payload)
+    for every in range(1, total + 1):
+        for s in payload:
+            s["embedded"] = thinned(s["extrapolated"], every)
+        shown = sum(sum(s["embedded"]) for s in payload)
+        if shown * (size + flips) <= total * budget:
+            break
     for s in payload:
-        s["embedded"] = thinned(s["extrapolated"], every)
-        for holder, key in [
-            (s, "truth"),
-            (s, "input"),
-            *((t, k) for t in s["tracks"] for k in ("images", "flip")),
-        ]:
-            kept = [x if k else None for x, k in zip(holder[key] or [], s["embedded"], strict=False)]
-            holder[key] = kept or None
+        of_tracks = [(track, key) for track in s["tracks"] for key in ("images", "flip")]
+        for holder, key in [(s, "truth"), (s, "input"), *of_tracks]:
+            if holder[key]:
+                pairs = zip(holder[key], s["embedded"], strict=True)
+                holder[key] = [what if here else None for what, here in pairs]
+            else:
+                holder[key] = None
     lists = [s[k] or [] for s in payload for k in ("truth", "input")]
     lists += [t["images"] for s in payload for t in s["tracks"]]
     files, about = images.encode(name, {i for some in lists for i in some if i is not None})
@@ -173,11 +178,8 @@ def _embed(payload: list[dict[str, Any]], images: Images, budget: float) -> tupl
                 if file is not None:
                     track["flip"][i] = len(uris)
                     uris.append(_uri("jpeg", file))
-    if every > 1:
-        shown = sum(sum(s["embedded"]) for s in payload)
-        about += (
-            f"; {shown} of {sum(len(s['frames']) for s in payload)} frames have images here, all have numbers"
-        )
+    if shown < total:
+        about += f"; {shown} of {total} frames have images here, all have numbers"
     return uris, about
 
 
