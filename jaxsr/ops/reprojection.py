@@ -17,11 +17,12 @@ or logarithm, sky is +inf). Demodulation, masks and blending are left to the cal
 
 import functools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxsr.errors import JaxsrError
 from jaxsr.ops._batch import over_batch
@@ -31,9 +32,11 @@ DEFAULT_SIGMA_GUIDE = 0.1
 DEFAULT_SIGMA_SPACE = 1.0
 """Standard deviation of the distance to xbar, in pixels."""
 
-_TINY_SIGMA = 1e-12  # keeps 1/sigma finite
-_FAR = 1e15  # guide value of what is not there; its square is finite and beats every clipped difference
-_CLIP = 1e12  # scaled guides stay far below _FAR
+_TINY_SIGMA = 1e-9  # keeps 1/sigma finite
+_CLIP = 1e12  # scaled guides stay below; the squares of their differences ...
+_NOWHERE = 1e28  # ... stay far below this, ...
+_FAR = 1e15  # ... and those to what is not there lie far above, and are finite
+_NORMAL = 1e-12  # keeps keys out of the denormal numbers, which some processors flush to 0
 
 
 @functools.partial(jax.jit, static_argnames=("strides", "radius", "count"))
@@ -86,30 +89,19 @@ def reproject(
     """
     _check(previous, motion_px, guide, previous_guide, jnp.shape(sigma_guide), strides, radius, count)
     offsets = candidate_offsets(strides, radius)
-    dtype = jnp.promote_types(guide.dtype, jnp.float32)
-    inverse_guide = jnp.broadcast_to(_inverse_sigma(sigma_guide, dtype), guide.shape[-1:])
-    inverse_space = _inverse_sigma(sigma_space, dtype)
-
-    # Saving what the second pass gathers would cost `count` copies of everything; gathering again is cheap.
-    @jax.checkpoint
-    def filter_kept(
-        value: Array, motion: Array, g: Array, g_prev: Array, words: list[Array]
-    ) -> tuple[Array, Array]:
-        kept = _unpack(words, len(offsets), min(count, len(offsets)))
-        return _filter(value, motion, g.astype(dtype), g_prev.astype(dtype), kept, offsets, scales)
-
-    scales = inverse_guide, inverse_space
+    scale = jnp.broadcast_to(_inverse_sigma(sigma_guide), guide.shape[-1:])
+    scale_space = _inverse_sigma(sigma_space)
 
     def one(value: Array, motion: Array, g: Array, g_prev: Array) -> tuple[Array, Array]:
-        fixed = jax.lax.stop_gradient((motion, g, g_prev, *scales))
-        words = _select(*fixed, offsets=offsets, count=min(count, len(offsets)))
-        return filter_kept(value, motion, g, g_prev, words)
+        near = _neighbourhood(motion, g, g_prev, scale, scale_space, reach=int(np.abs(offsets).max()))
+        kept = _select(jax.lax.stop_gradient(near), offsets, min(count, len(offsets)))
+        return _filter(value, near, offsets, kept)
 
     return over_batch(one, previous, motion_px, guide, previous_guide)
 
 
 def candidate_offsets(strides: Sequence[int], radius: int) -> Int[np.ndarray, "n 2"]:
-    """The distinct offsets (dx, dy) of N(xbar) from [xbar]: the centre, then stride by stride in row order."""
+    """The distinct offsets (dx, dy) of N(xbar) from [xbar]: the centre, then by stride, in row order."""
     steps = range(-radius, radius + 1)
     offsets = {(0, 0): None} | {(k * s, l * s): None for s in strides for l in steps for k in steps}
     return np.array(list(offsets), dtype=np.int32)
@@ -131,6 +123,8 @@ def _check(
     shapes = [a.shape for a in (previous, motion, guide, previous_guide)]
     if len({s[:-1] for s in shapes}) != 1:
         fail("image sizes differ", "equal [.., H, W]", shapes)
+    if 0 in previous.shape:
+        fail("empty image", "at least one pixel and channel", previous.shape)
     if guide.shape != previous_guide.shape or guide.shape[-1] == 0:
         fail("guides differ", "the same channels, at least one", [guide.shape, previous_guide.shape])
     if sigma_shape not in ((), (1,), guide.shape[-1:]):
@@ -139,163 +133,157 @@ def _check(
         fail("bad neighbourhood", "strides >= 1, radius >= 0, count >= 1", (strides, radius, count))
 
 
-def _inverse_sigma(sigma: Array | float, dtype: jnp.dtype) -> Array:
+def _inverse_sigma(sigma: Array | float) -> Array:
     """1 / (sqrt(2) sigma): squares of scaled differences are then minus the logarithm of the Gaussian."""
-    return np.sqrt(0.5).item() / jnp.maximum(jnp.asarray(sigma, dtype), _TINY_SIGMA)
+    return np.sqrt(0.5).item() / jnp.maximum(jnp.asarray(sigma, jnp.float32), _TINY_SIGMA)
 
 
-def _whole_and_fraction(
-    motion: Float[Array, "h w 2"], reach: int
-) -> tuple[Int[Array, "h w"], Int[Array, "h w"], Float[Array, "h w"], Float[Array, "h w"]]:
-    """[xbar] as (x, y), at most one pixel out of reach of the frame, and [xbar] - xbar per axis.
+class _Neighbourhood(NamedTuple):
+    """All that the weight of a candidate depends on, in float32; guides are divided by sqrt(2) sigma_0.
 
-    Rounding the motion, not x - motion, keeps the fraction exact and a uniform motion uniform.
+    The previous guide is padded, so widely that every candidate is a constant step from [xbar], and with
+    values so far from any guide that what lies outside needs no test: it is just extremely different. So
+    is a pixel whose guide is not finite.
     """
-    h, w, _ = motion.shape
-    wholes, fractions = [], []
-    for axis, size in ((0, w), (1, h)):
-        m = motion[..., axis]
-        m = jnp.clip(jnp.where(jnp.isnan(m), 0, m), -(size + reach), size + reach)
-        whole = jax.lax.stop_gradient(jnp.round(m))
-        grid = jnp.arange(size)[None, :] if axis == 0 else jnp.arange(size)[:, None]
-        wholes.append(jnp.clip(grid - whole.astype(jnp.int32), -reach - 1, size + reach))
-        fractions.append(m - whole)
-    return wholes[0], wholes[1], fractions[0], fractions[1]
+
+    x: Int[Array, "h w"]
+    """[xbar], at most one pixel out of reach of the frame."""
+    y: Int[Array, "h w"]
+    fx: Float[Array, "h w"]
+    """[xbar] - xbar."""
+    fy: Float[Array, "h w"]
+    scale_space: Float[Array, ""]
+    here: Float[Array, "g h w"]
+    there: Float[Array, "hp wp g"]
+    usable: Bool[Array, "h w"]
+    """False where the pixel's own guide or motion is not finite."""
 
 
-def _excess(offset: Array | int, fraction: Array, scale: Array) -> Array:
-    """(|xbar - y|^2 - |xbar - [xbar]|^2) / (2 sigma_1^2) along one axis, y = [xbar] + offset; never negative."""
-    return (offset * (2 * fraction + offset)) * jnp.square(scale)
-
-
-def _select(
+def _neighbourhood(
     motion: Float[Array, "h w 2"],
     guide: Float[Array, "h w g"],
     previous_guide: Float[Array, "h w g"],
-    inverse_guide: Float[Array, " g"],
-    inverse_space: Float[Array, ""],
+    scale: Float[Array, " g"],
+    scale_space: Float[Array, ""],
     *,
-    offsets: Int[np.ndarray, "n 2"],
-    count: int,
-) -> list[UInt32[Array, "h w"]]:
-    """Numbers of the `count` heaviest candidates, heaviest first, packed into as few words as they need.
+    reach: int,
+) -> _Neighbourhood:
+    h, w, _ = guide.shape
+    known = ~jnp.isnan(motion).any(-1)
+    # Rounding the motion, not x - motion, keeps the fraction exact and a uniform motion uniform.
+    limit = jnp.array([w + reach, h + reach], jnp.float32)[None, None, :]
+    m = jnp.clip(jnp.where(known[..., None], motion, 0).astype(jnp.float32), -limit, limit)
+    whole = jax.lax.stop_gradient(jnp.round(m))
+    step = whole.astype(jnp.int32)
 
-    One word has one consumer, so XLA makes a single loop over pixels of everything here and keeps the
-    candidates in registers; with several outputs it would repeat the gathers for each. What is padded
-    around the frame is so far from any guide that no candidate needs a bounds test.
-    """
-    h, w, channels = guide.shape
-    reach = int(np.abs(offsets).max())
-    pad, stride = 2 * reach + 1, w + 2 * (2 * reach + 1)
-    x, y, fx, fy = _whole_and_fraction(motion.astype(jnp.float32), reach)
-
-    scale = inverse_guide.astype(jnp.float32)
-    here = jnp.moveaxis(_finite(guide.astype(jnp.float32), 0.0) * scale[None, None, :], -1, 0)
-    there = _finite(previous_guide.astype(jnp.float32), jnp.inf) * scale[None, None, :]
-    here, there = (
-        jnp.clip(here, -_CLIP, _CLIP),
-        jnp.where(there < jnp.inf, jnp.clip(there, -_CLIP, _CLIP), _FAR),
-    )
-    there = jnp.pad(there, ((pad, pad), (pad, pad), (0, 0)), constant_values=_FAR).reshape(-1, channels)
-
-    # Unsigned: signed indices are tested for being negative at every gather.
-    corner = ((y + reach + 1) * stride + (x + reach + 1)).astype(jnp.uint32)
-    # The added constant keeps keys out of the denormal numbers, which some processors flush to 0.
-    along_x = {dx: _excess(dx, fx, inverse_space.astype(jnp.float32)) + 1e-12 for dx in _distinct(offsets, 0)}
-    along_y = {dy: _excess(dy, fy, inverse_space.astype(jnp.float32)) for dy in _distinct(offsets, 1)}
-    tag_bits = _tag_bits(len(offsets))
-
-    best = [jnp.full((h, w), np.float32(3e38))] * count
-    for number, (dx, dy) in enumerate(offsets.tolist()):
-        rows = there.at[corner + np.uint32((dy + reach) * stride + dx + reach)].get(mode="promise_in_bounds")
-        distance = along_x[dx] + along_y[dy]
-        for c in range(channels):
-            distance = distance + jnp.square(here[c] - rows[..., c])
-        bits = jax.lax.bitcast_convert_type(distance, jnp.int32)
-        key = jax.lax.bitcast_convert_type((bits >> tag_bits << tag_bits) | number, jnp.float32)
-        for slot in range(count):  # insertion; a selected comparison is one instruction, jnp.minimum is not
-            closer = best[slot] < key
-            best[slot], key = jnp.where(closer, best[slot], key), jnp.where(closer, key, best[slot])
-
-    tags = [jax.lax.bitcast_convert_type(b, jnp.uint32) & np.uint32((1 << tag_bits) - 1) for b in best]
-    per_word = 32 // tag_bits
-    return [
-        functools.reduce(
-            jnp.bitwise_or, [t << np.uint32(i * tag_bits) for i, t in enumerate(tags[at : at + per_word])]
+    def scaled(g: Array, otherwise: float) -> tuple[Array, Array]:
+        finite = jnp.isfinite(g).all(-1)
+        inside = jnp.clip(
+            jnp.where(finite[..., None], g, 0).astype(jnp.float32) * scale[None, None, :], -_CLIP, _CLIP
         )
-        for at in range(0, count, per_word)
-    ]
+        return jnp.where(finite[..., None], inside, otherwise), finite
+
+    here, finite = scaled(guide, 0.0)
+    there, _ = scaled(previous_guide, _FAR)
+    pad = 2 * reach + 1
+    return _Neighbourhood(
+        x=jnp.clip(jnp.arange(w)[None, :] - step[..., 0], -reach - 1, w + reach),
+        y=jnp.clip(jnp.arange(h)[:, None] - step[..., 1], -reach - 1, h + reach),
+        fx=(m - whole)[..., 0],
+        fy=(m - whole)[..., 1],
+        scale_space=scale_space,
+        here=jnp.moveaxis(here, -1, 0),
+        there=jnp.pad(there, ((pad, pad), (pad, pad), (0, 0)), constant_values=_FAR),
+        usable=known & finite,
+    )
 
 
-def _unpack(words: list[UInt32[Array, "h w"]], candidates: int, count: int) -> list[Int[Array, "h w"]]:
-    tag_bits = _tag_bits(candidates)
-    per_word, mask = 32 // tag_bits, np.uint32((1 << tag_bits) - 1)
-    shifts = [(words[i // per_word], np.uint32(i % per_word * tag_bits)) for i in range(count)]
-    return [((word >> shift) & mask).astype(jnp.int32) for word, shift in shifts]
+def _distance(near: _Neighbourhood, dx: Array | int, dy: Array | int) -> Float[Array, "h w"]:
+    """Minus the logarithm of w_x(y) / G(xbar - [xbar]) for y = [xbar] + (dx, dy); never negative."""
+    h, w = near.x.shape
+    hp, wp, channels = near.there.shape
+    corner = (near.y + (hp - h) // 2) * wp + near.x + (wp - w) // 2
+    # Unsigned: a signed index would be tested for being negative.
+    row = near.there.reshape(-1, channels).at[(corner + (dy * wp + dx)).astype(jnp.uint32)]
+    there = row.get(mode="promise_in_bounds")
+    # |xbar - y|^2 - |xbar - [xbar]|^2, free of cancellation.
+    distance = (dx * (2 * near.fx + dx) + dy * (2 * near.fy + dy)) * jnp.square(near.scale_space)
+    for c in range(channels):
+        distance = distance + jnp.square(near.here[c] - there[..., c])
+    return distance
+
+
+def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -> list[Int[Array, "h w"]]:
+    """Numbers of the `count` heaviest candidates, heaviest first.
+
+    Keys are distances whose last bits are replaced by the candidate's number. The winners are packed into
+    as few words as they need: one output lets XLA compile everything here to one loop over pixels that
+    keeps the candidates in registers, where several outputs would each repeat the gathers.
+    """
+    bits = max(1, (len(offsets) - 1).bit_length())
+    per_word, mask = 32 // bits, np.uint32((1 << bits) - 1)
+
+    def words() -> list[Array]:
+        best = [jnp.full(near.x.shape, np.float32(3e38))] * count
+        for number, (dx, dy) in enumerate(offsets.tolist()):
+            distance = _distance(near, dx, dy) + _NORMAL
+            key = jax.lax.bitcast_convert_type(distance, jnp.int32) >> bits << bits
+            key = jax.lax.bitcast_convert_type(key | number, jnp.float32)
+            for slot in range(count):  # insertion; where() is one instruction here, jnp.minimum is several
+                closer = best[slot] < key
+                best[slot], key = jnp.where(closer, best[slot], key), jnp.where(closer, key, best[slot])
+        tags = [jax.lax.bitcast_convert_type(b, jnp.uint32) & mask for b in best]
+        shifted = [tag << np.uint32(i % per_word * bits) for i, tag in enumerate(tags)]
+        return [
+            functools.reduce(jnp.bitwise_or, shifted[i : i + per_word]) for i in range(0, count, per_word)
+        ]
+
+    # A loop that runs once, which the compiler cannot know: without it, it would copy all of the above into
+    # each place that reads a winner.
+    blank = [jnp.zeros(near.x.shape, jnp.uint32) for _ in range(0, count, per_word)]
+    packed = jax.lax.while_loop(
+        lambda s: s[0], lambda s: (jnp.zeros_like(s[0]), words()), (_opaque_true(near), blank)
+    )[1]
+    numbers = [(packed[i // per_word] >> np.uint32(i % per_word * bits)) & mask for i in range(count)]
+    return [number.astype(jnp.int32) for number in numbers]
 
 
 def _filter(
     value: Float[Array, "h w c"],
-    motion: Float[Array, "h w 2"],
-    guide: Float[Array, "h w g"],
-    previous_guide: Float[Array, "h w g"],
-    kept: list[Int[Array, "h w"]],
+    near: _Neighbourhood,
     offsets: Int[np.ndarray, "n 2"],
-    scales: tuple[Float[Array, " g"], Float[Array, ""]],
+    kept: list[Int[Array, "h w"]],
 ) -> tuple[Float[Array, "h w c"], Float[Array, "h w 1"]]:
     """The normalised sum over the kept candidates, and the confidence. Plain differentiable code."""
-    h, w, channels = guide.shape
-    inverse_guide, inverse_space = scales
-    x, y, fx, fy = _whole_and_fraction(motion.astype(guide.dtype), int(np.abs(offsets).max()))
-    usable = jnp.isfinite(guide).all(-1) & ~jnp.isnan(motion).any(-1)
-    here = _finite(guide, 0.0)
-    values, guides = value.reshape(h * w, -1), previous_guide.reshape(h * w, channels)
-
-    def candidate(number: Array) -> tuple[Array, Array, Array]:
-        dx, dy = jnp.asarray(offsets[:, 0])[number], jnp.asarray(offsets[:, 1])[number]
-        inside = (x + dx >= 0) & (x + dx < w) & (y + dy >= 0) & (y + dy < h)
-        index = jnp.clip(y + dy, 0, h - 1) * w + jnp.clip(x + dx, 0, w - 1)
-        row = guides.at[index].get(mode="promise_in_bounds")
-        valid = inside & usable & jnp.isfinite(row).all(-1)
-        difference = jnp.where(valid[..., None], here - row, 0) * inverse_guide[None, None, :]
-        distance = _excess(dx.astype(fx.dtype), fx, inverse_space) + _excess(
-            dy.astype(fy.dtype), fy, inverse_space
-        )
-        for c in range(channels):
-            distance = distance + jnp.square(difference[..., c])
-        return index, valid, jnp.minimum(distance, 1e30)
-
+    h, w, channels = value.shape
     # Where nothing is valid the first slot holds the centre, whose clamped pixel is the fallback.
-    kept = [jnp.where(usable, kept[0], 0), *kept[1:]]
-    indices, valids, distances = zip(*map(candidate, kept), strict=True)
-    any_valid = functools.reduce(jnp.logical_or, valids)
-    least = functools.reduce(
-        jnp.minimum, [jnp.where(v, d, 1e30) for v, d in zip(valids, distances, strict=True)]
+    kept = [jnp.where(near.usable, kept[0], 0), *kept[1:]]
+    steps = [(jnp.asarray(offsets[:, 0])[number], jnp.asarray(offsets[:, 1])[number]) for number in kept]
+
+    distances = jax.lax.cond(  # again only to have them computed once
+        _opaque_true(near),
+        lambda: [_distance(near, dx, dy) for dx, dy in steps],
+        lambda: [jnp.zeros((h, w)) for _ in steps],
     )
-    shift = jax.lax.stop_gradient(least)
+    valid = near.usable & (distances[0] < _NOWHERE)
+    nearest = jax.lax.stop_gradient(distances[0])  # the heaviest: no exponent is positive, but for ties
+    weights = [jnp.exp(jnp.minimum(nearest - d, 0)) for d in distances]
     weights = [
-        jnp.where(v, jnp.exp(jnp.minimum(shift - d, 0)), 0) for v, d in zip(valids, distances, strict=True)
+        jnp.where(valid & (d < _NOWHERE), weight, 0) for weight, d in zip(weights, distances, strict=True)
     ]
-    weights[0] = jnp.where(any_valid, weights[0], 1)
+    weights[0] = jnp.where(valid, weights[0], 1)
     total = functools.reduce(jnp.add, weights)
 
-    image = jnp.zeros(value.shape, total.dtype)
-    for weight, valid, index in zip(weights, valids, indices, strict=True):
-        row = values.at[index].get(mode="promise_in_bounds").astype(total.dtype)
-        used = valid | ~any_valid  # a pixel without a guide may have no colour either: 0 * NaN
-        image = image + jnp.where(used[..., None], row, 0) * (weight / total)[..., None]
-    confidence = jnp.where(any_valid, jnp.exp(-least), 0)
-    return image.astype(value.dtype), confidence[..., None].astype(value.dtype)
+    pixels = value.reshape(h * w, channels)
+    image = jnp.zeros(value.shape, jnp.float32)
+    for (dx, dy), weight in zip(steps, weights, strict=True):
+        index = jnp.clip(near.y + dy, 0, h - 1) * w + jnp.clip(near.x + dx, 0, w - 1)
+        pixel = pixels.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds").astype(jnp.float32)
+        # What weighs nothing may not be a number: a pixel without a guide may have no colour either.
+        image = image + jnp.where((weight > 0)[..., None], pixel, 0) * weight[..., None]
+    confidence = jnp.where(valid, jnp.exp(-distances[0]), 0)
+    return (image / total[..., None]).astype(value.dtype), confidence[..., None]
 
 
-def _finite(guide: Float[Array, "h w g"], otherwise: float) -> Float[Array, "h w g"]:
-    """A pixel with any channel that is not finite has no guide."""
-    return jnp.where(jnp.isfinite(guide).all(-1, keepdims=True), guide, otherwise)
-
-
-def _distinct(offsets: Int[np.ndarray, "n 2"], axis: int) -> list[int]:
-    return sorted(set(offsets[:, axis].tolist()))
-
-
-def _tag_bits(candidates: int) -> int:
-    return max(1, (candidates - 1).bit_length())
+def _opaque_true(near: _Neighbourhood) -> Bool[Array, ""]:
+    return near.x[0, 0] < np.int32(2**31 - 1)
