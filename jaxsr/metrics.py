@@ -131,13 +131,20 @@ def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
     return _psnr_of(image_ - truth_, mask)
 
 
+def _gaussian(image: Array) -> Array:
+    """The window of SSIM over rows, then columns, where it lies inside the image."""
+    weights = np.exp(-0.5 * ((np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2) / SSIM_SIGMA) ** 2)
+    taps = [float(w) for w in weights / weights.sum()]
+    h, w = (n - SSIM_WINDOW + 1 for n in image.shape[:2])
+    # Sums of shifted images take a third of the time of dm-pix's own convolutions on a CPU. The barrier keeps
+    # XLA from fusing both passes into 121 taps a pixel.
+    rows = jax.lax.optimization_barrier(sum(t * image[k : k + h] for k, t in enumerate(taps)))
+    return sum(t * rows[:, k : k + w] for k, t in enumerate(taps))
+
+
 @jax.jit
 def _ssim_map(image: Array, truth: Array) -> Array:
-    # dm_pix mixes its integer window positions with floats; the strict modes of the tests are not its affair.
-    with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
-        return dm_pix.ssim(
-            image, truth, filter_size=SSIM_WINDOW, filter_sigma=SSIM_SIGMA, k1=0.01, k2=0.03, return_map=True
-        )
+    return dm_pix.ssim(image, truth, k1=0.01, k2=0.03, return_map=True, filter_fn=_gaussian)
 
 
 def ssim(image: Image, truth: Image, mask: Mask | None = None) -> float:

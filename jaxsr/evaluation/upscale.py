@@ -11,12 +11,11 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.run import check_needs, find_method, observed, rendered_schedule, stream
-from jaxsr.evaluation.tables import Section, Timing, Track
+from jaxsr.evaluation.tables import Section, Timing, measured
 from jaxsr.io.exr import write_exr
 from jaxsr.io.images import write_png
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.methods import Method
-from jaxsr.metrics import measure
 from jaxsr.ops import to_display
 
 Advance = Callable[[], Any]
@@ -105,7 +104,9 @@ def run_section(
                 expected=truths[0].shape,
                 found=images[0].shape,
             )
-        tracks.append(Track(method.name, images, measure(images, truths, starts), timing, method.summary))
+        tracks.append(
+            measured(method.name, images, truths, starts=starts, timing=timing, note=method.summary)
+        )
     task = f"x{scale}" if scale > 1 else "full size"
     if every == 2:
         task += ", every second frame extrapolated"
