@@ -24,19 +24,31 @@ BEHIND_PX = -1e6
 _NEAR = 1e-6
 
 
-def _rotate(matrix: Array, vectors: Array) -> Array:
-    # Full precision: reduced-precision matrix units would move points by pixels.
-    return jnp.einsum("ij,...j->...i", matrix, vectors, precision=jax.lax.Precision.HIGHEST)
+def rotate(matrix: Array, vectors: Array) -> Array:
+    """`matrix @ vector` for each of `[..., 3]` vectors."""
+    # Sums of products fuse, and no matrix unit rounds to fewer bits, which would move points by pixels.
+    lead = (None,) * (vectors.ndim - 1)
+    x, y, z = (vectors[..., k : k + 1] * matrix[:, k][lead] for k in range(3))
+    return x + y + z
 
 
-def _view_rays(camera: Camera, size: tuple[int, int], jitter: Array | None) -> Array:
-    """Rays of unit view depth in view space."""
-    pixels = pixel_grid(*size)
-    if jitter is not None:
-        pixels = pixels + jitter[None, None]
+def view_rays(pixels: Array, camera: Camera, size: tuple[int, int]) -> Array:
+    """View-space rays of unit view depth through `[h, w, 2]` positions of the unjittered image."""
     ndc = (pixels + 0.5) * jnp.array([2 / size[1], 2 / size[0]], jnp.float32)[None, None] - 1
     xy = (ndc + camera.lens_shift[None, None]) * camera.tan_half_fov[None, None]
     return jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
+
+
+def looked_at(size: tuple[int, int], jitter: Array | None) -> Array:
+    """Where in the unjittered image each pixel looked: p + J."""
+    return pixel_grid(*size) if jitter is None else pixel_grid(*size) + jitter[None, None]
+
+
+def view_from_view(camera: Camera, previous: Camera) -> tuple[Array, Array]:
+    """Rotation and translation from the view space of one camera to that of another."""
+    now, then = jnp.asarray(camera.world_from_view), jnp.asarray(previous.world_from_view)
+    turn = jnp.matmul(then[:3, :3].T, now[:3, :3], precision=jax.lax.Precision.HIGHEST)
+    return turn, rotate(then[:3, :3].T, now[:3, 3] - then[:3, 3])  # difference first: worlds are large
 
 
 def _project_view(points: Array, camera: Camera, size: tuple[int, int]) -> tuple[Array, Array]:
@@ -77,7 +89,7 @@ def view_directions(
 
     def one(matrix: Array, camera: Camera, jitter: Array | None) -> Array:
         jitter = None if jitter is None else jitter * scale
-        return _rotate(matrix[:3, :3], _view_rays(camera, size, jitter))
+        return rotate(matrix[:3, :3], view_rays(looked_at(size, jitter), camera, size))
 
     return over_batch(one, jnp.asarray(camera.world_from_view), camera, jitter_px, ndim=2)
 
@@ -96,7 +108,8 @@ def world_position(
 
     def one(depth: Array, camera: Camera, jitter: Array | None) -> Array:
         matrix = jnp.asarray(camera.world_from_view)
-        rays = _rotate(matrix[:3, :3], _view_rays(camera, (depth.shape[0], depth.shape[1]), jitter))
+        size = (depth.shape[0], depth.shape[1])
+        rays = rotate(matrix[:3, :3], view_rays(looked_at(size, jitter), camera, size))
         hit = jnp.isfinite(depth)
         point = matrix[None, None, :3, 3] + jnp.where(hit, depth, 0.0) * rays
         return jnp.where(hit, point, 0.0)
@@ -126,7 +139,7 @@ def project(
 
     def one(matrix: Array, camera: Camera, world: Array) -> tuple[Array, Array]:
         offset = world - matrix[(None,) * (world.ndim - 1) + (slice(3), 3)]
-        return _project_view(_rotate(matrix[:3, :3].T, offset), camera, size)
+        return _project_view(rotate(matrix[:3, :3].T, offset), camera, size)
 
     return over_batch(one, jnp.asarray(camera.world_from_view), camera, world, ndim=2)
 
@@ -155,14 +168,12 @@ def camera_motion(
 
     def one(depth: Array, camera: Camera, before: Camera, jitter: Array | None) -> Array:
         size = (depth.shape[0], depth.shape[1])
-        now, then = jnp.asarray(camera.world_from_view), jnp.asarray(before.world_from_view)
-        turn = jnp.matmul(then[:3, :3].T, now[:3, :3], precision=jax.lax.Precision.HIGHEST)
-        shift = _rotate(then[:3, :3].T, now[:3, 3] - then[:3, 3])  # differences first: worlds are large
+        turn, shift = view_from_view(camera, before)
+        here = looked_at(size, jitter)
         # Homogeneous points ray + shift / depth: at infinite depth only the rotation is left.
         inverse = jnp.where(jnp.isfinite(depth), 1 / jnp.where(depth > _NEAR, depth, _NEAR), 0.0)
-        points = _rotate(turn, _view_rays(camera, size, jitter)) + inverse * shift[None, None]
+        points = rotate(turn, view_rays(here, camera, size)) + inverse * shift[None, None]
         pixels, _ = _project_view(points, before, size)
-        here = pixel_grid(*size) if jitter is None else pixel_grid(*size) + jitter[None, None]
         return here - pixels
 
     return over_batch(one, depth_linear, camera, previous_camera, jitter_px)
