@@ -177,11 +177,14 @@ def bar(console: Console, total: float, what: str) -> Iterator[tuple[Progress, T
         yield progress, progress.add_task(what, total=total)
 
 
-def is_complete(folder: Path, clip: Clip) -> bool:
+def is_complete(folder: Path, clip: Clip, config: Render) -> bool:
+    """Whether all frames are there, as the configuration asks for them."""
     if not (folder / "sequence.json").is_file():
         return False
-    indices = [info.index for info in Sequence.open(folder).infos]
-    return set(range(1, clip.frames + 1)) <= set(indices)
+    seq = Sequence.open(folder)
+    same = seq.size == size_of(config) and set(config.scales) <= set(seq.scales)
+    same = same and config.samples in (None, seq.generator.get("samples"))
+    return same and set(range(1, clip.frames + 1)) <= {info.index for info in seq.infos}
 
 
 def find_archives(search: Path | None) -> list[Path]:
@@ -199,6 +202,10 @@ def from_archive(config: Render, clip: Clip, folder: Path) -> bool:
         name = f"{config.set}/{clip.name}"
         head = manifest["sequences"].get(name)
         if head is None or tuple(head["size"]) != size_of(config) or len(head["frames"]) < clip.frames:
+            continue
+        if not set(config.scales) <= set(head["scales"]):
+            continue
+        if config.samples not in (None, head["generator"].get("samples")):
             continue
         unpack_sequence(archive, manifest, name, folder)
         return True
@@ -225,7 +232,7 @@ def render_set(config: Render, console: Console) -> None:
         try:
             for clip in clips:
                 progress.update(task, description=f"{config.set} {clip.name}")
-                if not is_complete(base / clip.name, clip) and not from_archive(
+                if not is_complete(base / clip.name, clip, config) and not from_archive(
                     config, clip, base / clip.name
                 ):
                     _render_clip(config, clip, base / clip.name, deadline, progress, task, finished)

@@ -211,7 +211,9 @@ def test_render_takes_what_an_archive_has_and_needs_no_blender(packed, tmp_path,
     _, file = packed
     monkeypatch.setenv("JAXSR_BLENDER", "nowhere")
     monkeypatch.setattr(md, "SHARED", tmp_path / "no shared folder")
-    config = md.Render(set="train", scenes=("bunker",), clips=1, frames=3, size=SIZE, out=tmp_path / "out")
+    config = md.Render(
+        set="train", scenes=("bunker",), clips=1, frames=3, size=SIZE, scales=(2,), out=tmp_path / "out"
+    )
     with pytest.raises(JaxsrError, match="JAXSR_BLENDER"):
         md.render_set(config, quiet())
     monkeypatch.setattr(md, "SHARED", file.parent)

@@ -5,8 +5,9 @@ starts `blender_script.py` inside Blender (blender_process.py), takes its raw mu
 events, converts them (blender_convert.py) and writes the sequence frame by frame.
 
 Every frame is HR colour and G-buffer, and LR colour and G-buffer at each scale, jittered. The renders are
-point samples (no anti-aliasing), without motion blur, depth of field and compositing. Not handled: cameras
-that are not perspective, volumes, transparent surfaces (the G-buffer describes the first surface).
+point samples (no anti-aliasing) by Cycles on the CPU, whatever engine the scene names, without motion blur,
+depth of field, transparent film and compositing. Not handled: cameras that are not perspective, animated lens
+shift, volumes, transparent surfaces (the G-buffer describes the first surface).
 """
 
 import hashlib
@@ -226,8 +227,8 @@ class _Reporter:
         scales: Sequence[int],
     ):
         self.progress, self.total, self.done, self.part = progress, last - first + 1, done, 0.0
-        # A G-buffer costs about as much as six samples (all passes, synchronisation, writing).
-        cost = {"color": described["samples"] + 2.0, "gbuffer": 6.0}
+        # A G-buffer costs about as much as two samples of colour (measured on three scenes).
+        cost = {"color": described["samples"] + 0.5, "gbuffer": 2.0}
         work = {("hr" if s == 1 else f"x{s}", k): c / s**2 for s in (1, *scales) for k, c in cost.items()}
         self.share = {key: value / sum(work.values()) for key, value in work.items()}
 

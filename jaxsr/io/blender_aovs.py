@@ -176,6 +176,9 @@ def _material_tree(material: Any) -> Any:
 def add_outputs(material: Any, cache: dict) -> None:
     """Adds the AOV outputs to one material."""
     tree = _material_tree(material)
+    ours = (COLOR_AOV, *VALUE_AOVS, INSTANCE_AOV)
+    for node in [n for n in tree.nodes if n.type == "OUTPUT_AOV" and n.aov_name in ours]:
+        tree.nodes.remove(node)
     output = tree.get_output_node("CYCLES")
     surface = _NOTHING
     if output is not None and output.inputs["Surface"].is_linked:
