@@ -191,7 +191,8 @@ def position_mask(
             tap_hit = jnp.isfinite(tap)
             distance = jnp.zeros(depth.shape)
             for axis, pixel_index in enumerate((x, y)):
-                looked = pixel_index[..., None] + (0.0 if jitter_before is None else jitter_before[axis])
+                looked = pixel_index[..., None].astype(jnp.float32)
+                looked += 0.0 if jitter_before is None else jitter_before[axis]
                 ndc = (looked + 0.5) * (2 / size[1 - axis]) - 1
                 ray = (ndc + before.lens_shift[axis]) * before.tan_half_fov[axis]
                 offset = jnp.where(tap_hit, tap, 1.0) * ray - point[..., axis : axis + 1]
