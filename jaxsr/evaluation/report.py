@@ -231,7 +231,8 @@ def write_report(
     definitions = [
         (
             "Images",
-            "display-referred: sRGB(clip(ACES(colour × exposure))), colour linear with Rec. 709 primaries",
+            "display-referred. Linear colour (Rec. 709) is shown as sRGB(clip(ACES(colour × exposure))); "
+            "PNG and JPEG frames are taken as they are",
         ),
         ("Exposure", ", ".join(f"{e:g}" for e in exposures)),
         ("Crop", "none: all pixels count, borders included"),
