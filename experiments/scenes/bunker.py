@@ -1,8 +1,9 @@
 """The bunker: concrete corridors, a machine hall and a pump room, after the UE4 "Bunker" of the papers.
 
-Every (seed, split, clip) places machines, crates, pipes and lamps anew on one floor plan and takes one shot of
-it; training and test shots walk different halves of each place. One lamp changes its colour at random on every
-frame (white, yellow, blue, red) and shines on pipes: history shows colours that the current frame does not have.
+Every (seed, split, clip) places machines, crates, pipes and lamps anew on one floor plan and takes one shot
+of it; training and test shots walk different halves of each place. One lamp changes its colour at random on
+every frame (white, yellow, blue, red) and shines on pipes: history shows colours that the current frame does
+not have.
 
     corridor  x -1.9..1.9, y -24..0, with a side corridor west at its south end (the L-turn)
     hall      x -8..8,     y 0..26,  6.5 m high: columns, crane, fan, robot arm, gallery, store
@@ -13,6 +14,7 @@ import math
 import random
 import sys
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import bpy
@@ -71,39 +73,38 @@ def shot(kind: str, split: str, rng: random.Random) -> Walk:
     side = rng.choice((-1, 1))
     if kind == "corridor":
         y = rng.uniform(-11.5, -9.5) if test else rng.uniform(-19.5, -14.0)
-        return Walk((0.45 * jitter, y, 1.62), 2 * jitter, rng.uniform(0.07, 0.10), look=9 * side,
-                    look_rate=-0.75 * side, pitch=-4, phase=phase)  # fmt: skip
+        speed = rng.uniform(0.07, 0.10)
+        start, heading, look = (0.45 * jitter, y, 1.62), 2 * jitter, 9 * side
+        return Walk(start, heading, speed, look=look, look_rate=-0.75 * side, pitch=-4, phase=phase)
     if kind == "pumps":
+        speed = rng.uniform(0.06, 0.08)
         if test:
-            return Walk((-17.8 + jitter, 9.1, 1.6), -92, rng.uniform(0.06, 0.08), 0.0, look=58, look_rate=0.45,
-                        pitch=-1, phase=phase)  # fmt: skip
-        return Walk((-11.5 + 1.2 * jitter, 9.4, 1.6), 90, rng.uniform(0.06, 0.08), look=-52 - 6 * jitter,
-                    look_rate=0.5 * side, pitch=-1, phase=phase)  # fmt: skip
+            start = (-17.8 + jitter, 9.1, 1.6)
+            return Walk(start, -92, speed, look=58, look_rate=0.45, pitch=-1, phase=phase)
+        start, look = (-11.5 + 1.2 * jitter, 9.4, 1.6), -52 - 6 * jitter
+        return Walk(start, 90, speed, look=look, look_rate=0.5 * side, pitch=-1, phase=phase)
     if kind == "hall":
         if test:
-            return Walk((1.6 + 0.5 * jitter, 23.0, 1.7), 172, rng.uniform(0.08, 0.11), -0.3, look=14,
-                        look_rate=0.4 * side, pitch=3, phase=phase)  # fmt: skip
-        return Walk((0.6 + 0.5 * jitter, rng.uniform(1.5, 3.5), 1.7), 0, rng.uniform(0.08, 0.11), look=10 * side,
-                    look_rate=-0.6 * side, pitch=3, phase=phase)  # fmt: skip
+            start, speed = (1.6 + 0.5 * jitter, 23.0, 1.7), rng.uniform(0.08, 0.11)
+            return Walk(start, 172, speed, -0.3, look=14, look_rate=0.4 * side, pitch=3, phase=phase)
+        start, speed = (0.6 + 0.5 * jitter, rng.uniform(1.5, 3.5), 1.7), rng.uniform(0.08, 0.11)
+        return Walk(start, 0, speed, look=10 * side, look_rate=-0.6 * side, pitch=3, phase=phase)
     if kind == "turn":
         if test:
-            return Walk((-8.0 + jitter, -22.1, 1.6), -90, 0.09, look=6 * side, look_rate=-0.7 * side, pitch=-3,
-                        phase=phase)  # fmt: skip
-        return Walk((-3.4 + 0.3 * jitter, -22.2, 1.6), -86, 0.10, 1.6, look=10, look_rate=1.3, pitch=-4,
-                    phase=phase)  # fmt: skip
+            start, look = (-8.0 + jitter, -22.1, 1.6), 6 * side
+            return Walk(start, -90, 0.09, look=look, look_rate=-0.7 * side, pitch=-3, phase=phase)
+        start = (-2.3 + 0.2 * jitter, -22.4, 1.6)
+        return Walk(start, -70, 0.09, 1.1, look=32, look_rate=0.75, pitch=-4, phase=phase)
     if kind == "gallery":
         if test:
-            return Walk(
-                (5.9, 21.5 + jitter, 4.9), 180, 0.07, look=-46, look_rate=-0.5, pitch=-17, phase=phase
-            )
-        return Walk(
-            (5.9, 4.5 + jitter, 4.9), 0, 0.07, look=44 + 5 * jitter, look_rate=0.5, pitch=-17, phase=phase
-        )
+            start = (5.9, 21.5 + jitter, 4.9)
+            return Walk(start, 180, 0.07, look=-46, look_rate=-0.5, pitch=-17, phase=phase)
+        start, look = (5.9, 4.5 + jitter, 4.9), 44 + 5 * jitter
+        return Walk(start, 0, 0.07, look=look, look_rate=0.5, pitch=-17, phase=phase)
+    rate = 0.55 * side
     if test:
-        return Walk(
-            (1.5, 15.5 + jitter, 1.6), 10, 0.075, look=-62, look_rate=0.55 * side, pitch=-2, phase=phase
-        )
-    return Walk((1.2, 5.0 + jitter, 1.6), 0, 0.075, look=-58, look_rate=0.55 * side, pitch=-2, phase=phase)
+        return Walk((1.5, 15.5 + jitter, 1.6), 10, 0.075, look=-62, look_rate=rate, pitch=-2, phase=phase)
+    return Walk((1.2, 5.0 + jitter, 1.6), 0, 0.075, look=-58, look_rate=rate, pitch=-2, phase=phase)
 
 
 class Place:
@@ -117,7 +118,7 @@ class Place:
         return Part(self.mats)
 
     def free(self, x: float, y: float, radius: float, clear: float = 0.75, low: bool = True) -> bool:
-        """Whether a disc on the floor is clear of the camera's path and of what stands there; if so, take it."""
+        """Whether a disc on the floor is clear of the camera's path and of what stands; then take it."""
         near = (
             min(math.hypot(p.x - x, p.y - y) for p in self.path if not low or p.z < 3)
             if self.low(low)
@@ -244,7 +245,7 @@ def pipe(
     """A pipe with rounded corners and bolted flanges along its straight runs."""
     g = p.part()
     g.tube(bend(points, max(2.2 * radius, 0.12)), radius, mat, 16)
-    for a, b in zip(points, points[1:], strict=False):
+    for a, b in pairwise(points):
         a, b = Vector(a), Vector(b)
         length, way = (b - a).length, (b - a).normalized()
         for i in range(int(length / flange)):
@@ -284,8 +285,8 @@ def pipe_rack(p: Place, x: float, y0: float, y1: float, top: float, face: int) -
     """Parallel pipes along y on a wall at `x`, facing `face` (+1: +x), with valves and brackets."""
     rng, z = p.rng, 0.42
     axis = "X" if face > 0 else "-X"
-    rows = [("teal", 0.15), ("steel", 0.075), ("copper", 0.055), ("red", 0.085), ("rusty", 0.11), ("white", 0.07),
-            ("yellow", 0.06), ("steel", 0.10)]  # fmt: skip
+    rows = [("teal", 0.15), ("steel", 0.075), ("copper", 0.055), ("red", 0.085), ("rusty", 0.11)]
+    rows += [("white", 0.07), ("yellow", 0.06), ("steel", 0.10)]
     rng.shuffle(rows)
     row = 0
     while z < top and row < len(rows):
@@ -496,8 +497,9 @@ def crane(p: Place, y0: float, speed: float, x0: float, drift: float) -> None:
     for x in (-7.5, 7.5):
         rails.box((x - 0.12, 0.4, 5.1), (x + 0.12, 25.9, 5.4), "yellow")
         for y in range(1, 26, 4):
-            rails.box((x - 0.1 if x < 0 else x - 0.1, y - 0.1, 4.7), ((x + 0.1), y + 0.1, 5.1), "dark")
-            rails.box((min(x, 8 * (1 if x > 0 else -1)), y - 0.08, 4.9), (max(x, 8 * (1 if x > 0 else -1)), y + 0.08, 5.1), "dark")  # fmt: skip
+            rails.box((x - 0.1, y - 0.1, 4.7), (x + 0.1, y + 0.1, 5.1), "dark")
+            wall_x = math.copysign(8, x)
+            rails.box((min(x, wall_x), y - 0.08, 4.9), (max(x, wall_x), y + 0.08, 5.1), "dark")
     rails.object("crane_rails")
     girder = p.part()
     for dy in (-0.55, 0.55):
@@ -548,7 +550,8 @@ def robot(p: Place, x: float, y: float) -> None:
         .rod((-0.3, 0, 0.6), (0.3, 0, 0.6), 0.2, "dark", 16)
     )
     waist = waist.object("robot_waist")
-    upper = p.part().box((-0.14, -0.12, -0.1), (0.14, 0.12, 1.35), "orange").rod((-0.26, 0, 1.3), (0.26, 0, 1.3), 0.17, "dark", 16)  # fmt: skip
+    upper = p.part().box((-0.14, -0.12, -0.1), (0.14, 0.12, 1.35), "orange")
+    upper.rod((-0.26, 0, 1.3), (0.26, 0, 1.3), 0.17, "dark", 16)
     upper.rod((0.2, 0.05, 0.1), (0.2, 0.05, 1.2), 0.035, "chrome", 8)
     upper = upper.object("robot_upper", parent=waist)
     fore = (
@@ -597,8 +600,12 @@ def pump(p: Place, x: float, y: float, rate: float) -> None:
     angle = lambda f: phase + rate * f  # noqa: E731
     hub = Vector((x - 0.9, y - 0.5, 0.85))
     co.key_motion(wheel.object("flywheel"), p.frames, lambda f: co.place(hub, (0, angle(f), 0)))
-    reach = lambda f: crank * math.cos(angle(f)) + math.sqrt(link**2 - (crank * math.sin(angle(f))) ** 2)  # noqa: E731
-    rod = p.part().box((0, -0.03, -0.045), (link, 0.03, 0.045), "chrome").rod((link, -0.08, 0), (link, 0.08, 0), 0.08, "steel", 12)  # fmt: skip
+
+    def reach(f: int) -> float:
+        return crank * math.cos(angle(f)) + math.sqrt(link**2 - (crank * math.sin(angle(f))) ** 2)
+
+    rod = p.part().box((0, -0.03, -0.045), (link, 0.03, 0.045), "chrome")
+    rod.rod((link, -0.08, 0), (link, 0.08, 0), 0.08, "steel", 12)
     tilt = lambda f: math.asin(-crank * math.sin(angle(f)) / link)  # noqa: E731
     co.key_motion(
         rod.object("connecting_rod"),
@@ -615,14 +622,15 @@ def pump(p: Place, x: float, y: float, rate: float) -> None:
 def gears(p: Place, at: tuple, rate: float) -> None:
     """Two meshing gears on a wall that faces +x."""
     for radius, teeth, dy, way, mat in ((0.62, 18, 0.0, 1, "brass"), (0.31, 9, 0.96, -2, "steel")):
-        g = p.part().rod((-0.06, 0, 0), (0.06, 0, 0), radius, mat, 36).rod((0.06, 0, 0), (0.12, 0, 0), radius * 0.3, "dark", 16)  # fmt: skip
+        g = p.part().rod((-0.06, 0, 0), (0.06, 0, 0), radius, mat, 36)
+        g.rod((0.06, 0, 0), (0.12, 0, 0), radius * 0.3, "dark", 16)
         for i in range(teeth):
             turn = Matrix.Rotation(math.tau * (i + (0.5 if way < 0 else 0)) / teeth, 4, "X")
             g.box((-0.055, -0.05, radius - 0.02), (0.055, 0.05, radius + 0.08), mat, turn)
         for i in range(5):
             t = math.tau * i / 5
-            g.rod((0.055, radius * 0.62 * math.cos(t), radius * 0.62 * math.sin(t)),
-                  (0.075, radius * 0.62 * math.cos(t), radius * 0.62 * math.sin(t)), radius * 0.17, "dark", 12)  # fmt: skip
+            y, z = radius * 0.62 * math.cos(t), radius * 0.62 * math.sin(t)
+            g.rod((0.055, y, z), (0.075, y, z), radius * 0.17, "dark", 12)
         base = Matrix.Translation(Vector(at) + Vector((0, dy, 0)))
         spin(g.object("gear"), p.frames, base, "X", lambda f, w=way: w * rate * f)
 
@@ -756,9 +764,9 @@ def corridor(p: Place, colors: list[tuple], lit: bool) -> None:
     if not lit:
         return
     for y in (-19.0, -13.4, -7.8, -2.2):
-        tube_lamp(p, -side * 0.3, y + rng.uniform(-0.4, 0.4), 3.28, 1, rng.uniform(120, 170))
+        tube_lamp(p, -side * 0.3, y + rng.uniform(-0.4, 0.4), 3.28, 1, rng.uniform(205, 280))
     for x in (-13.0, -7.4):
-        tube_lamp(p, x, -22.2, 3.28, 0, rng.uniform(120, 170))
+        tube_lamp(p, x, -22.2, 3.28, 0, rng.uniform(150, 205))
     near = p.path[0]
     ahead = near.y + rng.uniform(3.2, 4.2) if near.y > -20 else -17.5
     flicker_lamp(
@@ -778,16 +786,13 @@ def hall(p: Place, colors: list[tuple], lit: str) -> None:
     columns.object("columns")
     for i, y in enumerate((4, 10, 16, 22)):
         for x, way in ((-4.9, 1), (4.3, -1)):
-            sign(f"{'A' if x < 0 else 'B'}{i + 1}", 0.5, p.mats["dark"], (x + way * 0.31, y, 1.75), (math.pi / 2, 0, way * math.pi / 2))  # fmt: skip
-            sign(
-                f"{'A' if x < 0 else 'B'}{i + 1}",
-                0.5,
-                p.mats["dark"],
-                (x, y - 0.31, 1.75),
-                (math.pi / 2, 0, 0),
-            )
-    crane(p, p.path[0].y + rng.uniform(3, 6) * (1 if p.path[-1].y >= p.path[0].y else -1) if p.path[0].x > -8 else 12,
-          rng.choice((-1, 1)) * rng.uniform(0.03, 0.06), rng.uniform(-2.5, 0.5), rng.uniform(-0.04, 0.04))  # fmt: skip
+            text, dark = f"{'A' if x < 0 else 'B'}{i + 1}", p.mats["dark"]
+            sign(text, 0.5, dark, (x + way * 0.31, y, 1.75), (math.pi / 2, 0, way * math.pi / 2))
+            sign(text, 0.5, dark, (x, y - 0.31, 1.75), (math.pi / 2, 0, 0))
+    start, ahead = p.path[0], 1 if p.path[-1].y >= p.path[0].y else -1
+    crane_y = start.y + rng.uniform(3, 6) * ahead if start.x > -8 else 12
+    speed = rng.choice((-1, 1)) * rng.uniform(0.03, 0.06)
+    crane(p, crane_y, speed, rng.uniform(-2.5, 0.5), rng.uniform(-0.04, 0.04))
     for x, y in ((-2.9, 7.2), (-3.0, 18.6)):
         if p.free(x, y, 1.0, 0.9):
             robot(p, x, y)
@@ -859,9 +864,10 @@ def pumps(p: Place, colors: list[tuple], lit: bool) -> None:
     for i, x in enumerate((-20.2, -16.8, -13.4, -10.2)):
         x += rng.uniform(-0.3, 0.3)
         tank(p, x, 16.6, rng.uniform(0.85, 1.1), rng.uniform(3.0, 3.9), mats[i])
-        pipe(p, [(x + 1.35, 17.9, 0.5), (x + 1.35, 17.3, 0.5), (x + 1.35, 17.3, 4.4), (x + 1.35, 17.9, 4.4)], 0.11,
-             rng.choice(("copper", "red", "yellow")), 1.5)  # fmt: skip
-        valve(p, (x + 1.35, 17.3, 1.5), "-Y", 0.11, rng.choice(("red", "yellow")), 0.06)
+        side = x + 1.35
+        riser = [(side, 17.9, 0.5), (side, 17.3, 0.5), (side, 17.3, 4.4), (side, 17.9, 4.4)]
+        pipe(p, riser, 0.11, rng.choice(("copper", "red", "yellow")), 1.5)
+        valve(p, (side, 17.3, 1.5), "-Y", 0.11, rng.choice(("red", "yellow")), 0.06)
         pipe(p, [(x, 16.6, 3.8), (x, 16.6, 4.55), (x, 14.0, 4.55)], 0.12, "steel", 1.6)
     pipe(p, [(-22, 14.0, 4.55), (-8.4, 14.0, 4.55)], 0.2, "teal", 2.6)
     pipe(p, [(-22, 13.4, 4.6), (-8.4, 13.4, 4.6)], 0.11, "red", 2.2)

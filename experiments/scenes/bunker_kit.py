@@ -1,8 +1,9 @@
 """Building blocks of the bunker scene: materials with a noise-free ambient term, and the mesh builder `Part`.
 
-The ambient light is emission (base colour times a sky/ground gradient times short-range occlusion) instead of
-diffuse bounces: the truth stays clean at few samples. For the same reason diffuse rays see no emission, and glossy
-rays see lamps dimmed (rare hits of bright lamps are what fireflies are made of). UV coordinates are metres on every surface.
+The ambient light is emission (base colour times a sky/ground gradient times short-range occlusion) instead
+of diffuse bounces: the truth stays clean at few samples. For the same reason diffuse rays see no emission,
+and glossy rays see lamps dimmed (rare hits of bright lamps are what fireflies are made of). UV coordinates
+are metres on every surface.
 """
 
 import math
@@ -98,8 +99,9 @@ def concrete(
     bricks = n.node(
         "ShaderNodeTexBrick",
         {
-            "Vector": uv, "Color1": (1.06, 1.05, 1.02), "Color2": (0.84, 0.86, 0.88), "Mortar": (0.34, 0.33, 0.32),
-            "Scale": 1.0, "Mortar Size": 0.016, "Mortar Smooth": 0.2, "Brick Width": panel[0], "Row Height": panel[1],
+            "Vector": uv, "Color1": (1.06, 1.05, 1.02), "Color2": (0.84, 0.86, 0.88),
+            "Mortar": (0.34, 0.33, 0.32), "Scale": 1.0, "Mortar Size": 0.016, "Mortar Smooth": 0.2,
+            "Brick Width": panel[0], "Row Height": panel[1],
         },
         offset=0.0,
     )  # fmt: skip
@@ -175,8 +177,8 @@ def plates(
     cells = n.voronoi(uv, 9.0, output="Color")
     seams = n.node(
         "ShaderNodeTexBrick",
-        {"Vector": uv, "Color1": (1, 1, 1), "Color2": (0.8, 0.8, 0.8), "Mortar": (0.2, 0.2, 0.2), "Scale": 1.0,
-         "Mortar Size": 0.014, "Brick Width": size, "Row Height": size},
+        {"Vector": uv, "Color1": (1, 1, 1), "Color2": (0.8, 0.8, 0.8), "Mortar": (0.2, 0.2, 0.2),
+         "Scale": 1.0, "Mortar Size": 0.014, "Brick Width": size, "Row Height": size},
         offset=0.5,
     ).outputs["Color"]  # fmt: skip
     tone = n.mix(n.step(cells, 0.2, 0.8), [c * 0.75 for c in color], color)
@@ -226,7 +228,7 @@ def glow(name: str, color: co.Color, strength: float) -> bpy.types.Material:
 
 
 def seen(n: co.Nodes, camera: float, glossy: float) -> bpy.types.NodeSocket:
-    """An emission strength by the kind of ray that looks: the camera's, a reflection's, none for diffuse rays."""
+    """An emission strength by the kind of ray: the camera's, a reflection's, none for diffuse rays."""
     path = n.node("ShaderNodeLightPath")
     direct = n.math("MULTIPLY", path.outputs["Is Camera Ray"], camera)
     return n.math("ADD", direct, n.math("MULTIPLY", path.outputs["Is Glossy Ray"], glossy))
