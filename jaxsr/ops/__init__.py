@@ -36,7 +36,6 @@ from jaxsr.ops.masks import (
     stencil_mask,
 )
 from jaxsr.ops.reprojection import reproject
-from jaxsr.ops.reprojection import reproject
 from jaxsr.ops.resampling import (
     depth_to_space,
     pixel_grid,
@@ -76,7 +75,6 @@ __all__ = [
     "positions_from_jittered_motion",
     "positions_from_motion",
     "project",
-    "reproject",
     "reproject",
     "resize",
     "rgb_from_ycocg",
