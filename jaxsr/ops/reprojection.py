@@ -22,6 +22,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsr.errors import JaxsrError
@@ -108,10 +109,10 @@ def candidate_offsets(strides: Sequence[int], radius: int) -> Int[np.ndarray, "n
 
 
 def _check(
-    previous: Array,
-    motion: Array,
-    guide: Array,
-    previous_guide: Array,
+    previous: ArrayLike,
+    motion: ArrayLike,
+    guide: ArrayLike,
+    previous_guide: ArrayLike,
     sigma_shape: tuple[int, ...],
     strides: tuple[int, ...],
     radius: int,
@@ -120,15 +121,15 @@ def _check(
     def fail(what: str, expected: object, found: object) -> None:
         raise JaxsrError(what, where="reproject", expected=expected, found=found)
 
-    shapes = [a.shape for a in (previous, motion, guide, previous_guide)]
+    shapes = [jnp.shape(a) for a in (previous, motion, guide, previous_guide)]
     if len({s[:-1] for s in shapes}) != 1:
         fail("image sizes differ", "equal [.., H, W]", shapes)
-    if 0 in previous.shape:
-        fail("empty image", "at least one pixel and channel", previous.shape)
-    if guide.shape != previous_guide.shape or guide.shape[-1] == 0:
-        fail("guides differ", "the same channels, at least one", [guide.shape, previous_guide.shape])
-    if sigma_shape not in ((), (1,), guide.shape[-1:]):
-        fail("sigma_guide does not fit", f"a scalar or [{guide.shape[-1]}]", list(sigma_shape))
+    if 0 in shapes[0]:
+        fail("empty image", "at least one pixel and channel", shapes[0])
+    if shapes[2] != shapes[3] or shapes[2][-1] == 0:
+        fail("guides differ", "the same channels, at least one", shapes[2:])
+    if sigma_shape not in ((), (1,), shapes[2][-1:]):
+        fail("sigma_guide does not fit", f"a scalar or [{shapes[2][-1]}]", list(sigma_shape))
     if not strides or min(strides) < 1 or radius < 0 or count < 1:
         fail("bad neighbourhood", "strides >= 1, radius >= 0, count >= 1", (strides, radius, count))
 
@@ -207,7 +208,8 @@ def _distance(near: _Neighbourhood, dx: Array | int, dy: Array | int) -> Float[A
     row = near.there.reshape(-1, channels).at[(corner + (dy * wp + dx)).astype(jnp.uint32)]
     there = row.get(mode="promise_in_bounds")
     # |xbar - y|^2 - |xbar - [xbar]|^2, free of cancellation.
-    distance = (dx * (2 * near.fx + dx) + dy * (2 * near.fy + dy)) * jnp.square(near.scale_space)
+    sx, sy = jnp.asarray(dx, near.fx.dtype), jnp.asarray(dy, near.fy.dtype)
+    distance = (sx * (2 * near.fx + sx) + sy * (2 * near.fy + sy)) * jnp.square(near.scale_space)
     for c in range(channels):
         distance = distance + jnp.square(near.here[c] - there[..., c])
     return distance

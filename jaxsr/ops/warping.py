@@ -191,11 +191,12 @@ def _warp(image: Array, motion: Array, *, mode: Mode, boundary: Boundary) -> Arr
 
     if mode == "nearest":
         return tap(0, 0)
+    dtype = jnp.promote_types(image.dtype, fx.dtype)  # half-precision images are summed in the motion's
     rows = []
     for ky, wy in _kernel(mode, fy).items():
-        row = [wx[..., None] * tap(ky, kx) for kx, wx in _kernel(mode, fx).items()]
+        row = [wx[..., None] * tap(ky, kx).astype(dtype) for kx, wx in _kernel(mode, fx).items()]
         rows.append(wy[..., None] * functools.reduce(jnp.add, row))
-    return functools.reduce(jnp.add, rows)
+    return functools.reduce(jnp.add, rows).astype(image.dtype)
 
 
 def _origin(motion: Float[Array, "h w 2"]) -> Int[Array, " n"]:
