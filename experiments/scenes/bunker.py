@@ -126,7 +126,9 @@ def build(*, seed: int, split: str, clip: int, frames: int) -> None:
         choice = rng.choice([i for i in range(len(FLICKER)) if i != previous])
         colors.append(FLICKER[choice])
         previous = choice
-    place = Place(library(), rng, [matrix.translation for matrix in matrices], frames)
+    stains = co.generator("bunker stains", seed, split, clip)
+    shift = [0.0 if split == "test" else stains.uniform(20, 200) for _ in range(3)]
+    place = Place(library(shift), rng, [matrix.translation for matrix in matrices], frames)
     shell(place)
     corridor(place, colors, lit=kind in ("corridor", "turn"))
     hall(

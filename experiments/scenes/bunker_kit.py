@@ -9,6 +9,7 @@ are metres on every surface.
 import math
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 
 import bpy
@@ -84,7 +85,7 @@ def _new(name: str) -> tuple[bpy.types.Material, co.Nodes]:
     return mat, co.Nodes(mat)
 
 
-def concrete(
+def cast_concrete(
     name: str,
     tone: co.Color,
     panel: tuple[float, float],
@@ -92,10 +93,16 @@ def concrete(
     stain: float = 0.6,
     rough: tuple[float, float] = (0.45, 0.85),
     wet: float = 0.0,
+    shift: Point = (0, 0, 0),
 ) -> bpy.types.Material:
-    """Cast concrete: panel seams, blotches, vertical stains, a painted band up to 1.15 m, wet patches."""
+    """Cast concrete: panel seams, blotches, vertical stains, a painted band up to 1.15 m, wet patches.
+
+    `shift` moves the stains (metres): another one shows another wall.
+    """
     mat, n = _new(name)
-    uv, world = n.coordinates("UV"), n.world_position()
+    uv = n.coordinates("UV")
+    place = n.world_position()
+    world = n.mapping(place, location=shift)
     bricks = n.node(
         "ShaderNodeTexBrick",
         {
@@ -110,7 +117,7 @@ def concrete(
     grain = n.noise(world, 14.0, 2.0)
     color = n.mix(n.step(grain, 0.58, 0.72, 0, 0.35), color, (0.12, 0.115, 0.11))
     if band is not None:
-        height = n.node("ShaderNodeSeparateXYZ", {0: world}).outputs[2]
+        height = n.node("ShaderNodeSeparateXYZ", {0: place}).outputs[2]
         worn = n.math("GREATER_THAN", n.noise(world, 3.1, 4.0, 0.65), 0.40)
         inside = n.math("MULTIPLY", n.math("LESS_THAN", height, 1.15), worn)
         color = n.mix(inside, color, band)
@@ -253,9 +260,10 @@ def screen(name: str, color: co.Color, rows: float, shift: float) -> bpy.types.M
     return mat
 
 
-def library() -> dict[str, bpy.types.Material]:
-    """All materials of the bunker by short name."""
+def library(shift: Point = (0, 0, 0)) -> dict[str, bpy.types.Material]:
+    """All materials of the bunker by short name; `shift` moves the stains of the concrete (metres)."""
     ambient_group()
+    concrete = partial(cast_concrete, shift=shift)
     mats = {
         "wall": concrete("wall", (0.40, 0.39, 0.365), (2.4, 1.3), band=(0.045, 0.20, 0.20)),
         "hallwall": concrete(
