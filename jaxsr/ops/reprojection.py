@@ -268,8 +268,10 @@ def _filter(
         lambda: [jnp.zeros((h, w)) for _ in steps],
     )
     valid = near.usable & (distances[0] < _NOWHERE)
-    nearest = jax.lax.stop_gradient(distances[0])  # the heaviest: no exponent is positive, but for ties
-    weights = [jnp.exp(jnp.minimum(nearest - d, 0)) for d in distances]
+    # The first is the heaviest but for near-ties; the limit (not 0, where its gradient would be halved) only
+    # acts on those of weights below exp(-10^6).
+    nearest = jax.lax.stop_gradient(distances[0])
+    weights = [jnp.exp(jnp.minimum(nearest - d, 10)) for d in distances]
     weights = [
         jnp.where(valid & (d < _NOWHERE), weight, 0) for weight, d in zip(weights, distances, strict=True)
     ]
