@@ -152,6 +152,7 @@ def _material(name):
         _node(tree, "ShaderNodeCombineXYZ", {0: shade, 1: shade, 2: shade}).outputs[0],
         "MULTIPLY",
     )
+    colour.node.clamp_result = True  # the tint lifts white cloth past a base colour of 1
     wet = noise
     if name in ("plank", "cobble"):  # puddles metres wide
         wet = _node(
