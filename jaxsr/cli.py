@@ -12,10 +12,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
+from tyro.conf import Positional
 
 from jaxsr.errors import JaxsrError
-
-Positional = tyro.conf.Positional
 
 app = tyro.extras.SubcommandApp()
 

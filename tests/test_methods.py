@@ -167,7 +167,7 @@ def test_taau_history_does_not_bleed_across_a_silhouette():
     state = taau.State(image, jnp.ones((h, w, 1)), depth)
     motion = jnp.full((h, w, 2), 0.5)
     here = frame._replace(hr=frame.hr._replace(depth_linear=depth, motion_px=motion), cut=jnp.asarray(False))
-    history, weight = taau.fetch_history(state, here, taau.Options())
+    history, weight = taau.fetch_history(state.image, state.weight, state.depth_linear, here, taau.Options())
     right_edge = history[1:, w // 2]  # its left tap lies on the near surface
     np.testing.assert_allclose(right_edge, 5.0, rtol=1e-6)
     assert (weight[1:, w // 2] < 1).all()

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Iterator
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from jaxsr.errors import JaxsrError
@@ -98,7 +99,7 @@ def stream(method: Method, frames: Iterable[Frame], net: Any = None) -> Iterator
             if not bool(host_frame.rendered):
                 raise JaxsrError("the first frame is not rendered", fix="start at a rendered frame")
             # Nothing came before the first frame, wherever the clip was cut from.
-            host_frame = host_frame._replace(cut=np.asarray(True))
+            host_frame = host_frame._replace(cut=jnp.asarray(True))
         frame = jax.device_put(host_frame)
         if step is None:
             shape = jax.tree.map(np.shape, frame)

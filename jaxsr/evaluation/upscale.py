@@ -88,7 +88,7 @@ def run_section(
         write_png(out / "truth" / "png" / f"{info.index:04d}.png", truth)
     schedule = rendered_schedule(sequence, every)
     inputs = [
-        display(sequence.frame(i, scale).color_linear, sequence.exposure) if rendered else None
+        display(np.asarray(sequence.frame(i, scale).color_linear), sequence.exposure) if rendered else None
         for i, rendered in enumerate(schedule)
     ]
     starts = [info.cut for info in sequence.infos]

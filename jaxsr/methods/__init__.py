@@ -1,6 +1,6 @@
 """One file a method: which buffers it needs, and its step over a sequence."""
 
-from jaxsr.methods import guided, interpolation, taau
+from jaxsr.methods import guided, guided_taau, interpolation, taau
 from jaxsr.methods._method import Method
 
 METHODS: dict[str, Method] = {
@@ -11,6 +11,7 @@ METHODS: dict[str, Method] = {
         interpolation.method("bicubic"),
         taau.method(),
         guided.method(),
+        guided_taau.method(),
     )
 }
 

@@ -11,7 +11,7 @@ Disocclusions are filled from the nearest surface with like colour and orientati
 The output is also the next history, worth less where the match was poor.
 """
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -43,11 +43,37 @@ class State(NamedTuple):
     normal: Float[Array, "H W 3"]
 
 
+def surface(gbuffer: GBuffer) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 3"]]:
+    """Base colour and normal; `needs` promised that they are there."""
+    assert gbuffer.base_color is not None
+    assert gbuffer.normal is not None
+    return gbuffer.base_color, gbuffer.normal
+
+
 def guide(gbuffer: GBuffer) -> Float[Array, "H W 6"]:
     """g: base colour and normal."""
-    assert gbuffer.base_color is not None  # promised by `needs`
-    assert gbuffer.normal is not None
-    return jnp.concatenate([gbuffer.base_color, gbuffer.normal], -1)
+    return jnp.concatenate(surface(gbuffer), -1)
+
+
+def init(frame: Frame) -> State:
+    """An empty history."""
+    return State(taau.init(frame), *map(jnp.zeros_like, surface(frame.hr)))
+
+
+def extrapolate(options: Options, state: State, frame: Frame) -> tuple[State, Array]:
+    """A frame from its G-buffer and the history alone."""
+    previous = GBuffer(state.history.depth_linear, frame.hr.motion_px, state.normal, state.base_color)
+    lighting, confidence = reproject(
+        demodulate(state.history.image, state.base_color),
+        frame.hr.motion_px,
+        guide(frame.hr),
+        guide(previous),
+        **asdict(options),
+    )
+    image = modulate(lighting, surface(frame.hr)[0])
+    weight = backward_warp(state.history.weight, frame.hr.motion_px) * confidence
+    history = taau.State(image, weight, frame.hr.depth_linear)
+    return State(history, *surface(frame.hr)), image
 
 
 def method(options: Options | None = None, taau_options: taau.Options | None = None) -> Method:
@@ -55,36 +81,14 @@ def method(options: Options | None = None, taau_options: taau.Options | None = N
     o = options or Options()
     upscaler = taau.method(taau_options)
 
-    def init(frame: Frame) -> State:
-        empty = jnp.zeros_like(frame.hr.base_color)
-        return State(taau.init(frame), empty, empty)
-
     def upscale(net: None, state: State, frame: Frame) -> tuple[State, Array]:
         history, image = upscaler.step(net, state.history, frame)
-        return State(history, frame.hr.base_color, frame.hr.normal), image
-
-    def extrapolate(net: None, state: State, frame: Frame) -> tuple[State, Array]:
-        previous = GBuffer(state.history.depth_linear, frame.hr.motion_px, state.normal, state.base_color)
-        lighting, confidence = reproject(
-            demodulate(state.history.image, state.base_color),
-            frame.hr.motion_px,
-            guide(frame.hr),
-            guide(previous),
-            sigma_guide=o.sigma_guide,
-            sigma_space=o.sigma_space,
-            strides=o.strides,
-            radius=o.radius,
-            count=o.count,
-        )
-        image = modulate(lighting, frame.hr.base_color)
-        weight = backward_warp(state.history.weight, frame.hr.motion_px) * confidence
-        history = taau.State(image, weight, frame.hr.depth_linear)
-        return State(history, frame.hr.base_color, frame.hr.normal), image
+        return State(history, *surface(frame.hr)), image
 
     return Method(
         "guided",
         "TAAU; G-buffer-guided reprojection of the lighting where nothing was rendered",
         init,
-        by_rendered(init, upscale, extrapolate),
+        by_rendered(init, upscale, lambda net, state, frame: extrapolate(o, state, frame)),
         upscaler.needs | {"hr.base_color", "hr.normal"},
     )

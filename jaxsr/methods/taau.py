@@ -18,9 +18,11 @@ that was not rendered is the history warped backward, unclipped: the plain warp 
 beat.
 """
 
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -30,11 +32,10 @@ from jaxsr.ops import (
     backward_warp,
     inverse_tone_map,
     rgb_from_ycocg,
-    sample,
     tone_map,
     ycocg_from_rgb,
 )
-from jaxsr.ops.resampling import pixel_grid
+from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid
 
 
 @dataclass(frozen=True)
@@ -69,98 +70,159 @@ def init(frame: Frame) -> State:
     return State(jnp.zeros((*depth.shape[:-1], 3), depth.dtype), jnp.zeros_like(depth), jnp.zeros_like(depth))
 
 
-def gather_samples(
-    image: Float[Array, "h w c"], jitter_px: Float[Array, "2"], scale: int
-) -> tuple[Float[Array, "9 H W c"], Float[Array, "9 H W 1"]]:
-    """The 3 x 3 LR pixels around each HR pixel, and their squared distance to it in LR pixels.
+def to_working(color_linear: Float[Array, "H W 3"]) -> Float[Array, "H W 3"]:
+    """Where colours are averaged and clipped: YCoCg of tone-mapped colour."""
+    return ycocg_from_rgb(tone_map(color_linear, "reinhard"))
 
-    Pixels outside the image repeat the border.
+
+def from_working(color: Float[Array, "H W 3"]) -> Float[Array, "H W 3"]:
+    """The inverse of `to_working`, not negative."""
+    return inverse_tone_map(jnp.clip(rgb_from_ycocg(color), 0, 0.9999), "reinhard")
+
+
+class Estimate(NamedTuple):
+    """What one frame says of each HR pixel, in working space."""
+
+    color: Float[Array, "H W 3"]
+    low: Float[Array, "H W 3"]
+    high: Float[Array, "H W 3"]
+    """The box of the samples that count."""
+    confidence: Float[Array, "H W 1"]
+    """beta."""
+
+
+Alike = Callable[[Float[Array, "H W g"]], Float[Array, "H W 1"]]
+
+
+def estimate(
+    image: Float[Array, "h w c"], jitter_px: Float[Array, "2"], scale: int, options: Options, alike: Alike
+) -> Estimate:
+    """Reduce the 3 x 3 LR samples around each HR pixel; samples outside the image repeat the border.
+
+    Args:
+        image: colour in working space, then whatever `alike` wants to see of a sample.
+        alike: log of how likely a sample is to show the surface of the pixel, at most 0.
     """
-    height, width = image.shape[0] * scale, image.shape[1] * scale
-    position = (pixel_grid(height, width) + 0.5) / scale - 0.5 - jitter_px[None, None]
-    center = jnp.floor(position + 0.5)
-    offsets = [(i, j) for j in (-1, 0, 1) for i in (-1, 0, 1)]
-    samples, distances = [], []
-    for offset in offsets:
-        at = center + jnp.array(offset, position.dtype)[None, None]
-        samples.append(sample(image, at, mode="nearest", boundary="clamp"))
-        distances.append(jnp.sum((at - position) ** 2, -1, keepdims=True))
-    return jnp.stack(samples), jnp.stack(distances)
+    (h, w), c = (image.shape[0] * scale, image.shape[1] * scale), 3
+    y = (jnp.arange(h, dtype=image.dtype) + 0.5) / scale - 0.5 - jitter_px[1]
+    x = (jnp.arange(w, dtype=image.dtype) + 0.5) / scale - 0.5 - jitter_px[0]
+    middle_y, middle_x = jnp.floor(y + 0.5), jnp.floor(x + 0.5)
+
+    def taps(j: Array) -> Iterator[tuple[Array, Array, Array]]:
+        at_y = middle_y + j.astype(image.dtype)
+        rows = jnp.clip(at_y, 0, image.shape[0] - 1).astype(jnp.int32)
+        line = image[rows]
+        for i in (-1, 0, 1):
+            columns = jnp.clip(middle_x + i, 0, image.shape[1] - 1).astype(jnp.int32)
+            values = line[:, columns]
+            squared = ((at_y - y) ** 2)[:, None, None] + ((middle_x + i - x) ** 2)[None, :, None]
+            log_alike = alike(values[..., c:])
+            yield values[..., :c], squared, log_alike
+
+    def log_kernel(squared: Array, log_alike: Array) -> Array:
+        return log_alike - squared / (2 * options.kernel_sigma**2)
+
+    # Loops over rows, not unrolled sums: XLA would gather anew for every result that uses a sample.
+    def most(best: tuple[Array, Array], j: Array) -> tuple[tuple[Array, Array], None]:
+        for _, squared, log_alike in taps(j):
+            best = jnp.maximum(best[0], log_kernel(squared, log_alike)), jnp.maximum(best[1], log_alike)
+        return best, None
+
+    def add(carry: tuple[Array, ...], j: Array) -> tuple[tuple[Array, ...], None]:
+        total, color, low, high, confidence = carry
+        for values, squared, log_alike in taps(j):
+            # Relative to the best: where every sample is of another surface, the least bad one counts.
+            weight = jnp.exp(log_kernel(squared, log_alike) - best)
+            total, color = total + weight, color + weight * values
+            counts = log_alike >= best_alike - 3.0
+            low = jnp.minimum(low, jnp.where(counts, values, jnp.inf))
+            high = jnp.maximum(high, jnp.where(counts, values, -jnp.inf))
+            hit = jnp.exp(log_alike - squared * scale**2 / (2 * options.sample_sigma**2))
+            confidence = jnp.maximum(confidence, hit)
+        return (total, color, low, high, confidence), None
+
+    rows = jnp.array((-1, 0, 1))
+    one, three = jnp.zeros((h, w, 1), image.dtype), jnp.zeros((h, w, c), image.dtype)
+    best, best_alike = jax.lax.scan(most, (one - jnp.inf, one - jnp.inf), rows)[0]
+    start: tuple[Array, ...] = (one, three, three + jnp.inf, three - jnp.inf, one)
+    total, color, low, high, confidence = jax.lax.scan(add, start, rows)[0]
+    return Estimate(color / total, low, high, confidence)
 
 
 def accumulate(
-    history: Float[Array, "H W c"],
-    weight: Float[Array, "H W 1"],
-    samples: Float[Array, "9 H W c"],
-    kernel: Float[Array, "9 H W 1"],
-    confidence: Float[Array, "H W 1"],
-    options: Options,
-) -> tuple[Float[Array, "H W c"], Float[Array, "H W 1"]]:
-    """Blend the samples of one frame into the history; both are tone-mapped RGB.
-
-    Args:
-        weight: n', zero where the history is no good.
-        kernel: weight of each sample in the current estimate; all zero is allowed.
-        confidence: beta.
+    history: Float[Array, "H W 3"], weight: Float[Array, "H W 1"], now: Estimate, options: Options
+) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 1"]]:
+    """Blend the estimate of one frame into the history, which is worth `weight` (n'), in working space.
 
     Returns:
         The new history and its weight.
     """
-    total = jnp.sum(kernel, 0)
-    # With no sample of weight (all kernels underflow) the middle one stands in.
-    current = jnp.where(total > 1e-12, jnp.sum(kernel * samples, 0) / jnp.maximum(total, 1e-12), samples[4])
-    box = ycocg_from_rgb(samples)
-    low, high = jnp.min(box, 0), jnp.max(box, 0)
-    middle, half = 0.5 * (low + high), 0.5 * options.box * (high - low)
-    clipped = rgb_from_ycocg(jnp.clip(ycocg_from_rgb(history), middle - half, middle + half))
-    beta = jnp.maximum(confidence, options.floor)
-    blended = (weight * clipped + beta * current) / (weight + beta)
+    middle, half = 0.5 * (now.low + now.high), 0.5 * options.box * (now.high - now.low)
+    clipped = jnp.clip(history, middle - half, middle + half)
+    beta = jnp.maximum(now.confidence, options.floor)
+    blended = (weight * clipped + beta * now.color) / (weight + beta)
     return blended, jnp.minimum(weight + beta, options.memory)
 
 
 def fetch_history(
-    state: State, frame: Frame, options: Options
-) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 1"]]:
+    history: Float[Array, "H W c"],
+    weight: Float[Array, "H W 1"],
+    previous_depth: Float[Array, "H W 1"],
+    frame: Frame,
+    options: Options,
+) -> tuple[Float[Array, "H W c"], Float[Array, "H W 1"]]:
     """The history at p - MV, from the taps that saw the same surface, and what it is worth.
 
     Catmull-Rom where all four bilinear taps agree in depth; their bilinear mean without the others where only
-    some do, so that nothing bleeds across a silhouette; weight 0 where none does, out of view, or at a cut.
-    Depths are compared as 1 / depth, which is linear across a plane: the tolerance is `depth_tolerance` of it
-    plus what the slope of the surface changes it by in one pixel.
+    some do, so that nothing bleeds across a silhouette; weight 0 where none does or out of view. Depths are
+    compared as 1 / depth, which is linear across a plane: the tolerance is `depth_tolerance` of it plus what
+    the slope of the surface changes it by in one pixel.
     """
-    height, width, _ = state.image.shape
-    position = pixel_grid(height, width) - frame.hr.motion_px
-    base = jnp.floor(position)
+    height, width, channels = history.shape
+    motion = frame.hr.motion_px
+    position = pixel_grid(height, width) - jnp.nan_to_num(motion)
+    base = jnp.clip(jnp.floor(position), -2, jnp.array((width, height), motion.dtype)[None, None])
     fraction = position - base
     inverse = 1 / frame.hr.depth_linear
-    tolerance = options.depth_tolerance * inverse + _slope(inverse) + 1e-6
-    packed = jnp.concatenate([state.image, state.weight, 1 / state.depth_linear], -1)
-    total = jnp.zeros((height, width, 5), packed.dtype)
-    agreeing = jnp.zeros((height, width, 1), packed.dtype)
-    all_agree = jnp.ones((height, width, 1), bool)
-    for i, j in ((0, 0), (1, 0), (0, 1), (1, 1)):
-        at = base + jnp.array((i, j), base.dtype)[None, None]
-        tap = sample(packed, at, mode="nearest", boundary="clamp")
-        inside = jnp.all(
-            (at >= 0) & (at <= jnp.array((width - 1, height - 1), base.dtype)[None, None]), -1, keepdims=True
-        )
-        agrees = inside & (jnp.abs(tap[..., 4:] - inverse) <= tolerance)
-        share = (fraction[..., :1] if i else 1 - fraction[..., :1]) * (
-            fraction[..., 1:] if j else 1 - fraction[..., 1:]
-        )
-        share = jnp.where(agrees, share, 0)
-        total = total + share * jnp.where(share > 0, tap, 0)  # an invalid history may hold anything
-        agreeing = agreeing + share
-        all_agree = all_agree & (agrees | (share == 0))
+    tolerance = options.depth_tolerance * inverse + slope(inverse) + 1e-6
+    packed = jnp.concatenate([history, weight, 1 / previous_depth], -1)
+
+    weights_x = kernel_taps(fraction[..., :1], "bicubic")
+    weights_y = jnp.stack(kernel_taps(fraction[..., 1:], "bicubic"))
+
+    def add_row(carry: tuple[Array, ...], j: Array) -> tuple[tuple[Array, ...], None]:
+        sharp, total, agreeing = carry
+        at_y = base[..., 1] + j.astype(base.dtype)
+        y = jnp.clip(at_y, 0, height - 1)
+        hat_y = jnp.maximum(1 - jnp.abs(j.astype(base.dtype) - fraction[..., 1:]), 0)
+        row = jnp.zeros_like(sharp)
+        for i in range(-1, 3):
+            at_x = base[..., 0] + i
+            x = jnp.clip(at_x, 0, width - 1)
+            tap = gather_pixels(packed, x.astype(jnp.int32), y.astype(jnp.int32))
+            row = row + weights_x[i + 1] * tap[..., :channels]
+            if i in (0, 1):
+                inside = ((at_x == x) & (at_y == y))[..., None]
+                agrees = inside & (jnp.abs(tap[..., -1:] - inverse) <= tolerance)
+                hat_x = fraction[..., :1] if i else 1 - fraction[..., :1]
+                share = jnp.where(agrees, hat_x * hat_y, 0)
+                total, agreeing = total + share * tap[..., :-1], agreeing + share
+        return (sharp + weights_y[j + 1] * row, total, agreeing), None
+
+    # A loop over rows, not an unrolled sum: XLA would gather anew for every channel of the result.
+    start: tuple[Array, ...] = (
+        jnp.zeros_like(history),
+        jnp.zeros_like(packed[..., :-1]),
+        jnp.zeros_like(weight),
+    )
+    sharp, total, agreeing = jax.lax.scan(add_row, start, jnp.arange(-1, 3))[0]
     some = total / jnp.maximum(agreeing, 1e-6)
-    sharp = backward_warp(state.image, frame.hr.motion_px, mode="bicubic")
-    image = jnp.where(all_agree & (agreeing > 0.999), sharp, some[..., :3])
     # A few agreeing taps far from p are worth less than four around it.
-    return jnp.maximum(image, 0), some[..., 3:4] * agreeing
+    return jnp.where(agreeing > 0.999, sharp, some[..., :-1]), some[..., -1:] * agreeing
 
 
-def _slope(inverse_depth: Float[Array, "H W 1"]) -> Float[Array, "H W 1"]:
-    """How much 1 / depth changes from a pixel to the next on the same surface: the smaller of both sides."""
+def slope(inverse_depth: Float[Array, "H W 1"]) -> Float[Array, "H W 1"]:
+    """Change of 1 / depth from a pixel to the next of its surface: per axis the smaller of both sides."""
     change = jnp.zeros_like(inverse_depth)
     for axis in (0, 1):
         step = jnp.abs(jnp.diff(inverse_depth, axis=axis))
@@ -173,6 +235,10 @@ def _slope(inverse_depth: Float[Array, "H W 1"]) -> Float[Array, "H W 1"]:
     return jnp.where(jnp.isfinite(change), change, 0)
 
 
+def _all_alike(features: Float[Array, "H W g"]) -> Float[Array, "H W 1"]:
+    return jnp.zeros((*features.shape[:2], 1), features.dtype)
+
+
 def method(options: Options | None = None) -> Method:
     """TAAU with these options."""
     o = options or Options()
@@ -182,21 +248,15 @@ def method(options: Options | None = None) -> Method:
         if frame.scale == 1:  # every pixel was sampled: nothing to accumulate
             image = frame.color_linear
             return State(image, jnp.full_like(depth, o.memory), depth), image
-        samples, squared = gather_samples(
-            tone_map(frame.color_linear, "reinhard"), frame.jitter_px, frame.scale
-        )
-        kernel = jnp.exp(-squared / (2 * o.kernel_sigma**2))
-        nearest = jnp.min(squared, 0) * frame.scale**2
-        confidence = jnp.exp(-nearest / (2 * o.sample_sigma**2))
-        history, weight = fetch_history(state, frame, o)
-        history = tone_map(history, "reinhard")
-        blended, weight = accumulate(history, weight, samples, kernel, confidence, o)
-        image = inverse_tone_map(jnp.clip(blended, 0, 0.9999), "reinhard")
+        now = estimate(to_working(frame.color_linear), frame.jitter_px, frame.scale, o, _all_alike)
+        before, weight = fetch_history(to_working(state.image), state.weight, state.depth_linear, frame, o)
+        blended, weight = accumulate(before, weight, now, o)
+        image = from_working(blended)
         return State(image, weight, depth), image
 
     def extrapolate(net: None, state: State, frame: Frame) -> tuple[State, Array]:
-        image = jnp.maximum(backward_warp(state.image, frame.hr.motion_px, mode="bilinear"), 0)
-        _, weight = fetch_history(state, frame, o)
+        image = backward_warp(state.image, frame.hr.motion_px, mode="bilinear")
+        _, weight = fetch_history(state.image[..., :0], state.weight, state.depth_linear, frame, o)
         return State(image, weight, frame.hr.depth_linear), image
 
     return Method(
