@@ -131,6 +131,8 @@ class Pack:
 
     dir: Annotated[Path, tyro.conf.Positional]
     archive: Annotated[Path, tyro.conf.Positional]
+    scenes: tuple[str, ...] = SCENES
+    """Only the sequences of these scenes."""
     color_bits: int = 5
     max_megabytes: float = 200.0
 
@@ -383,9 +385,17 @@ def measure_floor(config: Floor, console: Console) -> None:
 
 def pack_set(config: Pack, console: Console) -> None:
     """The verb `pack`. Names in the archive are the paths below `dir`, with the set in front."""
-    folders = sorted(p.parent for p in config.dir.rglob("sequence.json"))
+    folders = sorted(
+        p.parent
+        for p in config.dir.rglob("sequence.json")
+        if p.parent.name.startswith(tuple(f"{scene}-" for scene in config.scenes))
+    )
     if not folders:
-        raise JaxsrError("no sequences", where=config.dir, expected="folders with sequence.json")
+        raise JaxsrError(
+            "no sequences",
+            where=config.dir,
+            expected=f"folders {{{','.join(config.scenes)}}}-* with a sequence",
+        )
     top = config.dir.resolve()
     prefix = f"{top.name}/" if top.name in ("sample", "train", "test") else ""
     names = {prefix + f.resolve().relative_to(top).as_posix(): f for f in folders}

@@ -14,6 +14,7 @@ Writes experiments/results/tune_classical.json, .md and .png. The defaults in `j
 import json
 import platform
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -28,8 +29,9 @@ import tyro
 from rich.progress import track
 
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.demo import description, sample_folder
+from jaxsr.evaluation.demo import description
 from jaxsr.evaluation.run import observed
+from jaxsr.evaluation.sample import unpack_sample
 from jaxsr.frames import Frame
 from jaxsr.io.exr import atomic_path
 from jaxsr.io.sequence import Sequence as FrameSequence
@@ -169,11 +171,23 @@ def figure(path: Path, reprojection: dict[str, Any]) -> None:
 
 def main(config: Config) -> None:
     start = time.time()
-    root = config.data or sample_folder()
-    paths = sorted(path.parent for path in root.rglob("*-train-*/sequence.json"))
+    with tempfile.TemporaryDirectory() as temporary:
+        sequences = [FrameSequence.open(path) for path in training_sequences(config, Path(temporary))]
+        run(config, sequences, start)
+
+
+def training_sequences(config: Config, temporary: Path) -> list[Path]:
+    """The folders to search on."""
+    if config.data is None:
+        return unpack_sample(temporary, "train")
+    paths = sorted(path.parent for path in config.data.rglob("*-train-*/sequence.json"))
     if not paths:
-        raise JaxsrError("no training sequences", where=root, expected="folders *-train-*")
-    sequences = [FrameSequence.open(path) for path in paths]
+        raise JaxsrError("no training sequences", where=config.data, expected="folders *-train-*")
+    return paths
+
+
+def run(config: Config, sequences: list[FrameSequence], start: float) -> None:
+    """Search, and write the results."""
     pairs = [Pair(s, i) for s in sequences for i in range(1, len(s)) if not s.infos[i].cut]
     reprojection = tune_reprojection(pairs)
     clips = [

@@ -73,17 +73,13 @@ def demo(
     """
     from rich.console import Console
 
-    from jaxsr.evaluation.demo import run_demo, sample_sequences
+    from jaxsr.evaluation.demo import run_demo
+    from jaxsr.evaluation.sample import unpack_sample
     from jaxsr.evaluation.tables import rich_tables
 
-    sequences = sample_sequences()
-    names = [path.name.split("-")[0] for path in sequences]
-    unknown = sorted(set(scenes) - set(names))
-    if unknown:
-        raise JaxsrError(f"no scene {unknown[0]!r} in the sample", expected=", ".join(names))
-    chosen = [path for path, name in zip(sequences, names, strict=True) if not scenes or name in scenes]
     with _progress() as progress:
-        sections = run_demo(out, chosen, scale=scale, progress=progress)
+        sequences = unpack_sample(out / "sample", "test", scenes, progress)
+        sections = run_demo(out, sequences, scale=scale, progress=progress)
     console = Console()
     for table in rich_tables(sections):
         console.print(table)

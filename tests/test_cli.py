@@ -215,6 +215,6 @@ def test_render_errors(capsys, tmp_path, monkeypatch):
 def test_demo_errors(capsys, tmp_path, monkeypatch):
     assert "no scene 'moon'" in error_line(capsys, "demo", "-o", tmp_path, "--scenes", "moon")
     assert "scale 3 is not available" in error_line(capsys, "demo", "-o", tmp_path / "d", "--scale", "3")
-    monkeypatch.setattr("jaxsr.evaluation.demo.sample_folder", lambda: tmp_path / "none")
+    monkeypatch.setattr("jaxsr.evaluation.sample.sample_folder", lambda: tmp_path / "none")
     assert "sample is missing" in error_line(capsys, "demo", "-o", tmp_path / "d")
     assert not (tmp_path / "d").exists()

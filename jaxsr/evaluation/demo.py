@@ -1,6 +1,5 @@
 """`jaxsr demo`: the sample that ships with the package, upscaled and extrapolated, measured and shown."""
 
-import importlib.resources
 import platform
 import time
 from collections.abc import Callable, Sequence
@@ -11,32 +10,14 @@ import jax
 import numpy as np
 
 import jaxsr
-from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.report import write_report
 from jaxsr.evaluation.tables import Section, write_metrics
 from jaxsr.evaluation.upscale import run_section
 from jaxsr.evaluation.video import write_video
 from jaxsr.io.sequence import Sequence as FrameSequence
 
-UPSCALERS = ("nearest", "bilinear", "bicubic", "taau")
-EXTRAPOLATORS = ("nearest", "bilinear", "taau", "guided")
-
-
-def sample_folder() -> Path:
-    """The folder of the sample sequences inside the package."""
-    return Path(str(importlib.resources.files(jaxsr) / "sample"))
-
-
-def sample_sequences() -> list[Path]:
-    """The test sequences of the sample, one a scene.
-
-    Raises:
-        JaxsrError: the package was installed without them.
-    """
-    found = sorted(path.parent for path in sample_folder().glob("*-test-*/sequence.json"))
-    if not found:
-        raise JaxsrError("the sample is missing", where=sample_folder(), fix="reinstall jaxsr")
-    return found
+UPSCALERS = ("nearest", "bilinear", "bicubic", "taau", "guided-taau")
+EXTRAPOLATORS = ("nearest", "bilinear", "taau", "guided", "guided-taau")
 
 
 def description(**settings: Any) -> dict[str, Any]:

@@ -106,14 +106,14 @@ def _group(tree: Any, node: Any, socket: Any, cache: dict) -> Surface:
     key = (inner.name, socket.identifier)
     if key not in cache:
         outputs = [n for n in inner.nodes if n.type == "GROUP_OUTPUT"]
-        active = next((n for n in outputs if n.is_active_output), outputs[0] if outputs else None)
+        active: Any = next((n for n in outputs if n.is_active_output), outputs[0] if outputs else None)
         entry = (
             next((s for s in active.inputs if s.identifier == socket.identifier), None) if active else None
         )
         if entry is None or not entry.is_linked:
             return _NOTHING
         surface = describe(inner, entry.links[0].from_socket, cache)
-        exposed = []
+        exposed: list[Any] = []
         for kind, value in zip(("Color", "Float", "Float"), surface[:3], strict=True):
             if not _is_socket(value):
                 exposed.append(value)
@@ -123,13 +123,13 @@ def _group(tree: Any, node: Any, socket: Any, cache: dict) -> Surface:
             )
             inner.links.new(value, next(s for s in active.inputs if s.identifier == item.identifier))
             exposed.append(item.identifier)
-        cache[key] = Surface(*exposed, surface.weightless)
+        cache[key] = Surface(exposed[0], exposed[1], exposed[2], surface.weightless)
     stored = cache[key]
-    values = [
+    color, roughness, metallic = (
         next(s for s in node.outputs if s.identifier == value) if isinstance(value, str) else value
         for value in stored[:3]
-    ]
-    return Surface(*values, stored.weightless)
+    )
+    return Surface(color, roughness, metallic, stored.weightless)
 
 
 def describe(tree: Any, socket: Any, cache: dict) -> Surface:

@@ -216,7 +216,11 @@ def fingerprint(source: dict) -> str:
         with Path(source["blend"]).open("rb") as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
     script = Path(source["script"]).resolve()
-    loaded = [Path(m.__file__).resolve() for m in list(sys.modules.values()) if getattr(m, "__file__", None)]
+    loaded = [
+        Path(source_file).resolve()
+        for m in list(sys.modules.values())
+        if (source_file := getattr(m, "__file__", None))
+    ]
     digest = hashlib.sha256()
     for path in sorted({script, *(p for p in loaded if p.parent == script.parent and p.suffix == ".py")}):
         digest.update(path.name.encode() + b"\0" + path.read_bytes())

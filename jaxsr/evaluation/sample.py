@@ -1,0 +1,69 @@
+"""The rendered sample that ships with the package: three scenes, a test and a training clip of each.
+
+It travels as one archive a scene (`jaxsr.io.archive`), since OpenEXR would take several times the space, and
+is unpacked to ordinary sequences where it is used. docs/data_card.md describes it.
+"""
+
+import importlib.resources
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jaxsr
+from jaxsr.errors import JaxsrError
+from jaxsr.io.archive import read_manifest, unpack_sequence
+
+
+def sample_folder() -> Path:
+    """The folder of the archives inside the package."""
+    return Path(str(importlib.resources.files(jaxsr) / "sample"))
+
+
+def sample_scenes() -> list[str]:
+    """Names of the scenes.
+
+    Raises:
+        JaxsrError: the package was installed without its sample.
+    """
+    scenes = sorted(path.stem for path in sample_folder().glob("*.jsrz"))
+    if not scenes:
+        raise JaxsrError("the sample is missing", where=sample_folder(), fix="reinstall jaxsr")
+    return scenes
+
+
+def unpack_sample(
+    out: Path,
+    split: str,
+    scenes: tuple[str, ...] = (),
+    progress: Callable[[str, int], Callable[[], Any]] = lambda title, total: lambda: None,
+) -> list[Path]:
+    """Unpack the sequences of a split to `out/<name>`; what is there already is kept.
+
+    Args:
+        split: "test" or "train".
+        scenes: names; all by default.
+        progress: called with a title and a number of steps; returns what is called after each step.
+
+    Returns:
+        The folders, one a sequence.
+
+    Raises:
+        JaxsrError: no such scene or split, no sample, or a damaged archive.
+    """
+    known = sample_scenes()
+    unknown = sorted(set(scenes) - set(known))
+    if unknown:
+        raise JaxsrError(f"no scene {unknown[0]!r} in the sample", expected=", ".join(known))
+    found = []
+    for scene in scenes or known:
+        archive = sample_folder() / f"{scene}.jsrz"
+        manifest = read_manifest(archive)
+        found += [(archive, manifest, n) for n in manifest["sequences"] if f"-{split}-" in n]
+    if not found:
+        raise JaxsrError("no such part of the sample", where="split", expected="test or train", found=split)
+    advance = progress("unpack", len(found))
+    folders = []
+    for archive, manifest, name in found:
+        folders.append(unpack_sequence(archive, manifest, name, out / Path(name).name))
+        advance()
+    return folders
