@@ -128,6 +128,7 @@ def corridor(p: Place, colors: list[tuple], lit: bool) -> None:
     tray(p, side * 0.85, -19.8, -0.1, 2.95)
     cables(p, (-side * 1.84, -19.8, 2.45), (-side * 1.84, -0.3, 2.45), 4)
     y, number = -18.5 + rng.uniform(0, 1), rng.randint(2, 6)
+    last = ""
     while y < -1.5:
         kind = rng.choice(("door", "panel", "sign", "crates"))
         face = (side, 0)
@@ -137,14 +138,15 @@ def corridor(p: Place, colors: list[tuple], lit: bool) -> None:
             panel(p, -side * 1.9, y, face)
         elif kind == "sign":
             text = rng.choice((f"SECTOR {number:02d}", "DANGER", "EXIT >", "LEVEL -3", "NO ENTRY"))
-            sign(text, 0.42, p.mats[rng.choice(("dark", "yellow", "red"))], (-side * 1.885, y, 1.75),
-                 (math.pi / 2, 0, math.pi / 2 * side))  # fmt: skip
+            mat = p.mats[rng.choice(("dark", "yellow", "red"))]
+            if last != "sign":  # two in a row would run into each other
+                sign(text, 0.42, mat, (-side * 1.885, y, 1.75), (math.pi / 2, 0, math.pi / 2 * side))
         for dy in (-0.7, 0.9):
             if kind in ("crates", "sign") and p.free(-side * 1.45, y + dy, 0.32, 0.55):
                 barrel(p, -side * 1.45, y + dy) if rng.random() < 0.6 else crate(
                     p, -side * 1.45, y + dy, 0.6, 0
                 )
-        number += 1
+        number, last = number + 1, kind
         y += rng.uniform(1.7, 2.5)
     rib = p.part()
     for y in range(-18, 0, 6):
