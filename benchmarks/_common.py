@@ -1,8 +1,8 @@
 """What the benchmarks share: interleaved timing, peak memory of a fresh process, and the result files.
 
 Variants of one question are timed in turn, round after round, so that whatever else the machine does falls
-on all of them; the ratio to the reference variant is the median of the ratios within rounds. Memory is how far
-a fresh process's resident size rises while it runs the variant, results included, inputs and code not.
+on all of them; the ratio to the reference variant is the median of the ratios within rounds. Memory is how
+far a fresh process's resident size rises while it runs the variant, results included, inputs and code not.
 """
 
 import argparse

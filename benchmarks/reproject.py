@@ -12,6 +12,7 @@ where() for minimum 0.3, kept. Row bands and column strips gain nothing on top. 
 cannot remove keeps it from copying the selection into its readers: without it 4.5 times slower.
 """
 
+import functools
 import importlib.util
 from collections.abc import Callable
 from typing import Any
@@ -46,7 +47,8 @@ def with_jax(name: str, fn: Callable[..., Any], argnums: tuple[int, ...] = (), *
     return Variant(name, lambda inputs: _common.compiled(timed, inputs), **limits)
 
 
-def with_numba(inputs: Inputs) -> Prepared:
+@functools.cache
+def numba_loop() -> Callable[..., None]:
     import numba
 
     @numba.njit(fastmath=True, parallel=True)
@@ -90,6 +92,11 @@ def with_numba(inputs: Inputs) -> Prepared:
                     image[y, x, c] /= total
                 confidence[y, x] = np.exp((fx * fx + fy * fy) * scale_space - distance[0])
 
+    return loop
+
+
+def with_numba(inputs: Inputs) -> Prepared:
+    loop = numba_loop()
     previous, _, guide, _ = inputs
     scale = np.full(guide.shape[-1], np.sqrt(0.5) / SIGMAS["sigma_guide"], np.float32)
     scale_space = np.float32(0.5 / SIGMAS["sigma_space"] ** 2)
