@@ -1,14 +1,18 @@
-"""Find the constants of the classical methods on the training part of the sample, by coordinate search.
+"""Find the constants of the classical methods on training frames.
 
-    python experiments/tune_classical.py
+    python experiments/tune_classical.py reprojection          # the training part of the sample
+    python experiments/tune_classical.py taau --data DIR       # training clips, rendered by make_datasets.py
 
-Reprojection: sigma_guide (one for base colour and normal) and sigma_space. The true colour of frame t - 1 is
-reprojected to t, demodulated and modulated, and measured against the truth of t: PSNR of display colour over
-the whole frame, the mean over all pairs and scenes. TAAU: all constants of `taau.Options`, on the
-super-resolution of the clips, at every scale of the sequences alike. Test frames are not touched.
+Reprojection: sigma_guide (one for base colour and normal) and sigma_space, the whole grid. The true colour
+of frame t - 1 is reprojected to t, demodulated and modulated, and measured against the truth of t: PSNR of
+display colour over the whole frame, the mean over all pairs and scenes.
 
-Writes experiments/results/tune_classical.json, .md and .png. The defaults in `jaxsr.ops.reprojection` and
-`jaxsr.methods.taau` are the rounded optima.
+TAAU and guided TAAU: coordinate search over their options on the super-resolution of whole clips, every scale
+of the sequences alike, all frames but the first two. The three frames of the sample's training part are too
+few for that: a history takes longer to form.
+
+Test frames are not touched. Writes experiments/results/tune_<what>.json, .md and a figure. The defaults in
+`jaxsr.ops.reprojection` and `jaxsr.methods` are the rounded optima.
 """
 
 import json
@@ -19,7 +23,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -35,7 +39,7 @@ from jaxsr.evaluation.sample import unpack_sample
 from jaxsr.frames import Frame
 from jaxsr.io.exr import atomic_path
 from jaxsr.io.sequence import Sequence as FrameSequence
-from jaxsr.methods import guided, taau
+from jaxsr.methods import METHODS, Method, guided, guided_taau, taau
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
 
 matplotlib.use("Agg")
@@ -46,20 +50,24 @@ RESULTS = Path(__file__).resolve().parent / "results"
 SIGMA_GUIDE = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)
 SIGMA_SPACE = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.4, 2.0, 4.0)
 TAAU_GRID: dict[str, tuple[float, ...]] = {
-    "kernel_sigma": (0.2, 0.25, 0.3, 0.35, 0.4, 0.5),
+    "kernel_sigma": (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.7),
     "sample_sigma": (0.2, 0.25, 0.3, 0.35, 0.4, 0.5, 0.7),
-    "box": (0.75, 1.0, 1.25, 1.5, 2.0),
-    "memory": (1.0, 2.0, 4.0, 8.0, 16.0),
+    "box": (0.5, 0.75, 1.0, 1.25, 1.5, 2.0),
+    "memory": (1.0, 2.0, 4.0, 8.0),
     "floor": (0.005, 0.02, 0.05, 0.1, 0.2),
     "depth_tolerance": (0.005, 0.01, 0.02, 0.05),
 }
+GUIDED_GRID = {"sigma_guide": (0.05, 0.07, 0.1, 0.15, 0.2, 0.3)}
 
 
 @dataclass(frozen=True)
 class Config:
+    what: Annotated[Literal["reprojection", "taau"], tyro.conf.Positional]
     data: Path | None = None
     """Folder with training sequences; the sample's training part by default."""
-    rounds: int = 2
+    clips: int = 1
+    """Clips a scene, for TAAU."""
+    rounds: int = 1
     """Passes over the constants of TAAU."""
     out: Path = RESULTS
 
@@ -115,44 +123,71 @@ def tune_reprojection(pairs: Sequence[Pair]) -> dict[str, Any]:
     }
 
 
-def taau_score(clips: Sequence[tuple[list[Frame], jax.Array, float]]) -> Callable[[taau.Options], float]:
+Clip = tuple[list[Frame], jax.Array, float]
+
+
+def score(method: Method, clips: Sequence[Clip]) -> float:
     """Mean PSNR of super-resolution over all frames but the first two of each clip."""
-
-    def score(options: taau.Options) -> float:
-        method = taau.method(options)
-        step = jax.jit(method.step)
-        values = []
-        for frames, truths, exposure in clips:
-            state = method.init(frames[0])
-            for i, frame in enumerate(frames):
-                state, image = step(None, state, frame)
-                if i >= 2:
-                    values.append(psnr(image, truths[i], exposure))
-        return float(np.mean(values))
-
-    return score
+    step = jax.jit(method.step)
+    values = []
+    for frames, truths, exposure in clips:
+        state = method.init(frames[0])
+        for i, frame in enumerate(frames):
+            state, image = step(None, state, frame)
+            if i >= 2:
+                values.append(psnr(image, truths[i], exposure))
+    return float(np.mean(values))
 
 
-def tune_taau(clips: Sequence[tuple[list[Frame], jax.Array, float]], rounds: int) -> dict[str, Any]:
-    """Coordinate search from the defaults of `taau.Options`."""
-    score = taau_score(clips)
-    best = taau.Options()
-    value = score(best)
-    trials = [{**asdict(best), "psnr": value}]
+def coordinate_search(
+    start: Any, grid: dict[str, tuple[float, ...]], of: Callable[[Any], float], rounds: int, title: str
+) -> dict[str, Any]:
+    """The best options found by varying one field at a time, and all trials."""
+    best, value = start, of(start)
+    trials = [{"key": "start", "psnr": value}]
     for _ in range(rounds):
         before = best
-        for key, grid in TAAU_GRID.items():
-            for candidate in track(grid, f"TAAU {key}"):
+        for key, candidates in grid.items():
+            for candidate in track(candidates, f"{title} {key}"):
                 options = replace(best, **{key: candidate})
                 if options == best:
                     continue
-                found = score(options)
-                trials.append({**asdict(options), "psnr": found})
+                found = of(options)
+                trials.append({"key": key, "value": candidate, "psnr": found})
                 if found > value:
                     best, value = options, found
         if best == before:
             break
-    return {"options": asdict(best), "psnr": value, "trials": trials}
+    return {"options": asdict(best), "psnr": value, "start_psnr": trials[0]["psnr"], "trials": trials}
+
+
+def tune_taau(sequences: Sequence[FrameSequence], rounds: int) -> dict[str, Any]:
+    clips: list[Clip] = [
+        (
+            [jax.device_put(f) for f in observed(s, scale)],
+            jnp.stack([jnp.asarray(s.truth(i)) for i in range(len(s))]),
+            s.exposure,
+        )
+        for s in sequences
+        for scale in s.scales
+    ]
+    plain = coordinate_search(
+        taau.Options(), TAAU_GRID, lambda o: score(taau.method(o), clips), rounds, "taau"
+    )
+    start = guided_taau.Options()
+    temporal = coordinate_search(
+        start.temporal,
+        TAAU_GRID,
+        lambda o: score(guided_taau.method(replace(start, temporal=o)), clips),
+        rounds,
+        "guided-taau",
+    )
+    start = replace(start, temporal=taau.Options(**temporal["options"]))
+    guide = coordinate_search(
+        start, GUIDED_GRID, lambda o: score(guided_taau.method(o), clips), 1, "guided-taau"
+    )
+    bilinear = score(METHODS["bilinear"], clips)
+    return {"taau": plain, "guided_taau": guide, "guided_taau_temporal": temporal, "bilinear_psnr": bilinear}
 
 
 def figure(path: Path, reprojection: dict[str, Any]) -> None:
@@ -169,73 +204,82 @@ def figure(path: Path, reprojection: dict[str, Any]) -> None:
     plt.close(fig)
 
 
+def training_sequences(config: Config, temporary: Path) -> list[FrameSequence]:
+    if config.data is None:
+        paths = unpack_sample(temporary, "train")
+    else:
+        paths = sorted(path.parent for path in config.data.rglob("*-train-*/sequence.json"))
+        if not paths:
+            raise JaxsrError("no training sequences", where=config.data, expected="folders *-train-*")
+    if config.what == "taau":
+        by_scene: dict[str, list[Path]] = {}
+        for path in paths:
+            by_scene.setdefault(path.name.split("-")[0], []).append(path)
+        paths = [path for found in by_scene.values() for path in found[: config.clips]]
+    return [FrameSequence.open(path) for path in paths]
+
+
+def report(config: Config, result: dict[str, Any]) -> list[str]:
+    """The lines of the Markdown file after its head."""
+    if config.what == "reprojection":
+        figure(config.out / "tune_reprojection.png", result)
+        return [
+            f"sigma_guide = {result['sigma_guide']:g} and sigma_space = {result['sigma_space']:g} px give "
+            f"{result['psnr']:.2f} dB on {result['pairs']} pairs; the plain backward warp of the colour "
+            f"{result['plain_warp_psnr']:.2f} dB.",
+            "",
+            "![PSNR over both sigmas](tune_reprojection.png)",
+        ]
+    lines = [f"Bilinear interpolation reaches {result['bilinear_psnr']:.2f} dB.", ""]
+    for name in ("taau", "guided_taau"):
+        options = result[name]["options"]
+        flat = {**options.pop("temporal", {}), **options} if name == "guided_taau" else options
+        lines += [
+            f"{name}: " + ", ".join(f"{k} = {v:g}" for k, v in flat.items()) + ":",
+            f"{result[name]['psnr']:.2f} dB.",
+            "",
+        ]
+    return lines
+
+
 def main(config: Config) -> None:
     start = time.time()
     with tempfile.TemporaryDirectory() as temporary:
-        sequences = [FrameSequence.open(path) for path in training_sequences(config, Path(temporary))]
-        run(config, sequences, start)
-
-
-def training_sequences(config: Config, temporary: Path) -> list[Path]:
-    """The folders to search on."""
-    if config.data is None:
-        return unpack_sample(temporary, "train")
-    paths = sorted(path.parent for path in config.data.rglob("*-train-*/sequence.json"))
-    if not paths:
-        raise JaxsrError("no training sequences", where=config.data, expected="folders *-train-*")
-    return paths
-
-
-def run(config: Config, sequences: list[FrameSequence], start: float) -> None:
-    """Search, and write the results."""
-    pairs = [Pair(s, i) for s in sequences for i in range(1, len(s)) if not s.infos[i].cut]
-    reprojection = tune_reprojection(pairs)
-    clips = [
-        (
-            [jax.device_put(f) for f in observed(s, scale)],
-            jnp.stack([jnp.asarray(s.truth(i)) for i in range(len(s))]),
-            s.exposure,
-        )
-        for s in sequences
-        for scale in s.scales
-    ]
-    temporal = tune_taau(clips, config.rounds)
+        sequences = training_sequences(config, Path(temporary))
+        if config.what == "reprojection":
+            pairs = [Pair(s, i) for s in sequences for i in range(1, len(s)) if not s.infos[i].cut]
+            result = tune_reprojection(pairs)
+        else:
+            result = tune_taau(sequences, config.rounds)
     commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=RESULTS, capture_output=True, text=True, check=False
+        ["git", "rev-parse", "--short", "HEAD"],
+        cwd=Path(__file__).parent,
+        capture_output=True,
+        text=True,
+        check=False,
     ).stdout.strip()
     meta = description(
+        script=f"experiments/tune_classical.py {config.what}",
         commit=commit,
         processor=platform.processor() or platform.machine(),
         seconds=round(time.time() - start),
         sequences=[f"{s.name}: {len(s)} frames {s.size[0]}x{s.size[1]}" for s in sequences],
         seed="none: the search is deterministic",
-        rounds=config.rounds,
     )
     config.out.mkdir(parents=True, exist_ok=True)
-    with atomic_path(config.out / "tune_classical.json") as temporary:
-        text = json.dumps({"meta": meta, "reprojection": reprojection, "taau": temporal}, indent=1)
-        temporary.write_text(text + "\n")
-    figure(config.out / "tune_classical.png", reprojection)
+    with atomic_path(config.out / f"tune_{config.what}.json") as file:
+        file.write_text(json.dumps({"meta": meta, **result}, indent=1) + "\n")
     lines = [
-        "# Constants of the classical methods",
+        f"# Constants of {'guided reprojection' if config.what == 'reprojection' else 'TAAU'}",
         "",
-        f"Measured by `experiments/tune_classical.py` at {commit} on {meta['date']}, {meta['device']}, "
-        f"{meta['seconds']} s, on the training part of the sample. PSNR of display colour, whole frames.",
+        f"`{meta['script']}` at {commit} on {meta['date']}, {meta['device']}, {meta['seconds']} s; "
+        f"training frames: {', '.join(meta['sequences'])}. PSNR of display colour, whole frames.",
         "",
-        f"Guided reprojection of the true previous frame, {reprojection['pairs']} pairs: sigma_guide = "
-        f"{reprojection['sigma_guide']:g}, sigma_space = {reprojection['sigma_space']:g} px give "
-        f"{reprojection['psnr']:.2f} dB; the plain backward warp of the colour "
-        f"{reprojection['plain_warp_psnr']:.2f} dB.",
-        "",
-        "TAAU, super-resolution, mean over scales, clips and all frames but the first two: "
-        + ", ".join(f"{k} = {v:g}" for k, v in temporal["options"].items())
-        + f" give {temporal['psnr']:.2f} dB; the starting point {temporal['trials'][0]['psnr']:.2f} dB.",
-        "",
-        "![PSNR over both sigmas](tune_classical.png)",
+        *report(config, result),
         "",
     ]
-    with atomic_path(config.out / "tune_classical.md") as temporary:
-        temporary.write_text("\n".join(lines))
+    with atomic_path(config.out / f"tune_{config.what}.md") as file:
+        file.write_text("\n".join(lines))
     print("\n".join(lines))
 
 

@@ -28,10 +28,10 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxsr.errors import JaxsrError
 from jaxsr.ops._batch import over_batch
 
-DEFAULT_SIGMA_GUIDE = 0.1
-"""Standard deviation of guide differences; for guides in [0, 1] or unit normals."""
-DEFAULT_SIGMA_SPACE = 1.0
-"""Standard deviation of the distance to xbar, in pixels."""
+DEFAULT_SIGMA_GUIDE = 0.15
+"""Standard deviation of guide differences; for base colour and unit normals (experiments/tune_classical.py)."""
+DEFAULT_SIGMA_SPACE = 2.0
+"""Standard deviation of the distance to xbar, in pixels (likewise)."""
 
 _TINY_SIGMA = 1e-9  # keeps 1/sigma finite
 _CLIP = 1e12  # scaled guides stay below; the squares of their differences ...
@@ -94,7 +94,8 @@ def reproject(
     scale_space = _inverse_sigma(sigma_space)
 
     def one(value: Array, motion: Array, g: Array, g_prev: Array) -> tuple[Array, Array]:
-        near = _neighbourhood(motion, g, g_prev, scale, scale_space, reach=int(np.abs(offsets).max()))
+        there = _padded(g_prev, scale, pad=2 * int(np.abs(offsets).max()) + 1)
+        near = _Neighbourhood(motion, g, there, scale, scale_space)
         kept = _select(jax.lax.stop_gradient(near), offsets, min(count, len(offsets)))
         return _filter(value, near, offsets, kept)
 
@@ -140,78 +141,70 @@ def _inverse_sigma(sigma: Array | float) -> Array:
 
 
 class _Neighbourhood(NamedTuple):
-    """All that the weight of a candidate depends on, in float32; guides are divided by sqrt(2) sigma_0.
+    """All that the weight of a candidate depends on."""
 
-    The previous guide is padded, so widely that every candidate is a constant step from [xbar], and with
-    values so far from any guide that what lies outside needs no test: it is just extremely different. So
-    is a pixel whose guide is not finite.
-    """
-
-    x: Int[Array, "h w"]
-    """[xbar], at most one pixel out of reach of the frame."""
-    y: Int[Array, "h w"]
-    fx: Float[Array, "h w"]
-    """[xbar] - xbar."""
-    fy: Float[Array, "h w"]
-    scale_space: Float[Array, ""]
-    here: Float[Array, "g h w"]
+    motion: Float[Array, "h w 2"]
+    guide: Float[Array, "h w g"]
     there: Float[Array, "hp wp g"]
-    usable: Bool[Array, "h w"]
+    """The previous guide, scaled and padded."""
+    scale: Float[Array, " g"]
+    scale_space: Float[Array, ""]
+
+
+def _padded(guide: Float[Array, "h w g"], scale: Float[Array, " g"], pad: int) -> Float[Array, "hp wp g"]:
+    """The guide over sqrt(2) sigma_0, padded so widely that every candidate is a constant step from [xbar].
+
+    What lies outside is so far from any guide that it needs no test: it is just extremely different. So is
+    a pixel whose guide is not finite.
+    """
+    finite = jnp.isfinite(guide).all(-1, keepdims=True)
+    scaled = jnp.where(finite, guide, 0).astype(jnp.float32) * scale[None, None, :]
+    scaled = jnp.where(finite, jnp.clip(scaled, -_CLIP, _CLIP), _FAR)
+    return jnp.pad(scaled, ((pad, pad), (pad, pad), (0, 0)), constant_values=_FAR)
+
+
+def _centre(near: _Neighbourhood) -> tuple[Array, Array, Array, Array]:
+    """[xbar] as (x, y), at most one pixel out of reach of the frame, and [xbar] - xbar per axis."""
+    parts = []
+    for axis, padded in ((0, near.there.shape[1]), (1, near.there.shape[0])):
+        size = near.motion.shape[1 - axis]
+        reach = (padded - size) // 4
+        m = jnp.where(_known(near.motion), near.motion[..., axis], 0).astype(jnp.float32)
+        m = jnp.clip(m, -size - reach, size + reach)
+        # Rounding the motion, not x - motion, keeps the fraction exact and a uniform motion uniform.
+        whole = jax.lax.stop_gradient(jnp.round(m))
+        grid = jnp.arange(size)[None, :] if axis == 0 else jnp.arange(size)[:, None]
+        parts.append((jnp.clip(grid - whole.astype(jnp.int32), -reach - 1, size + reach), m - whole))
+    (x, fx), (y, fy) = parts
+    return x, y, fx, fy
+
+
+def _known(motion: Float[Array, "h w 2"]) -> Bool[Array, "h w"]:
+    return ~(jnp.isnan(motion[..., 0]) | jnp.isnan(motion[..., 1]))
+
+
+def _usable(near: _Neighbourhood) -> Bool[Array, "h w"]:
     """False where the pixel's own guide or motion is not finite."""
-
-
-def _neighbourhood(
-    motion: Float[Array, "h w 2"],
-    guide: Float[Array, "h w g"],
-    previous_guide: Float[Array, "h w g"],
-    scale: Float[Array, " g"],
-    scale_space: Float[Array, ""],
-    *,
-    reach: int,
-) -> _Neighbourhood:
-    h, w, _ = guide.shape
-    known = ~jnp.isnan(motion).any(-1)
-    # Rounding the motion, not x - motion, keeps the fraction exact and a uniform motion uniform.
-    limit = jnp.array([w + reach, h + reach], jnp.float32)[None, None, :]
-    m = jnp.clip(jnp.where(known[..., None], motion, 0).astype(jnp.float32), -limit, limit)
-    whole = jax.lax.stop_gradient(jnp.round(m))
-    step = whole.astype(jnp.int32)
-
-    def scaled(g: Array, otherwise: float) -> tuple[Array, Array]:
-        finite = jnp.isfinite(g).all(-1)
-        inside = jnp.clip(
-            jnp.where(finite[..., None], g, 0).astype(jnp.float32) * scale[None, None, :], -_CLIP, _CLIP
-        )
-        return jnp.where(finite[..., None], inside, otherwise), finite
-
-    here, finite = scaled(guide, 0.0)
-    there, _ = scaled(previous_guide, _FAR)
-    pad = 2 * reach + 1
-    return _Neighbourhood(
-        x=jnp.clip(jnp.arange(w)[None, :] - step[..., 0], -reach - 1, w + reach),
-        y=jnp.clip(jnp.arange(h)[:, None] - step[..., 1], -reach - 1, h + reach),
-        fx=(m - whole)[..., 0],
-        fy=(m - whole)[..., 1],
-        scale_space=scale_space,
-        here=jnp.moveaxis(here, -1, 0),
-        there=jnp.pad(there, ((pad, pad), (pad, pad), (0, 0)), constant_values=_FAR),
-        usable=known & finite,
-    )
+    finite = [jnp.isfinite(near.guide[..., c]) for c in range(near.guide.shape[-1])]
+    return functools.reduce(jnp.logical_and, finite) & _known(near.motion)
 
 
 def _distance(near: _Neighbourhood, dx: Array | int, dy: Array | int) -> Float[Array, "h w"]:
     """Minus the logarithm of w_x(y) / G(xbar - [xbar]) for y = [xbar] + (dx, dy); never negative."""
-    h, w = near.x.shape
-    hp, wp, channels = near.there.shape
-    corner = (near.y + (hp - h) // 2) * wp + near.x + (wp - w) // 2
+    h, w, channels = near.guide.shape
+    hp, wp, _ = near.there.shape
+    x, y, fx, fy = _centre(near)
+    corner = (y + (hp - h) // 2) * wp + x + (wp - w) // 2
     # Unsigned: a signed index would be tested for being negative.
     row = near.there.reshape(-1, channels).at[(corner + (dy * wp + dx)).astype(jnp.uint32)]
     there = row.get(mode="promise_in_bounds")
     # |xbar - y|^2 - |xbar - [xbar]|^2, free of cancellation.
-    sx, sy = jnp.asarray(dx, near.fx.dtype), jnp.asarray(dy, near.fy.dtype)
-    distance = (sx * (2 * near.fx + sx) + sy * (2 * near.fy + sy)) * jnp.square(near.scale_space)
+    sx, sy = jnp.asarray(dx, jnp.float32), jnp.asarray(dy, jnp.float32)
+    distance = (sx * (2 * fx + sx) + sy * (2 * fy + sy)) * jnp.square(near.scale_space)
+    usable = _usable(near)
     for c in range(channels):
-        distance = distance + jnp.square(near.here[c] - there[..., c])
+        here = jnp.where(usable, near.guide[..., c], 0).astype(jnp.float32) * near.scale[c]
+        distance = distance + jnp.square(jnp.clip(here, -_CLIP, _CLIP) - there[..., c])
     return distance
 
 
@@ -224,9 +217,10 @@ def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -
     """
     bits = max(1, (len(offsets) - 1).bit_length())
     per_word, mask = 32 // bits, np.uint32((1 << bits) - 1)
+    shape = near.motion.shape[:2]
 
     def words() -> list[Array]:
-        best = [jnp.full(near.x.shape, np.float32(3e38))] * count
+        best = [jnp.full(shape, np.float32(3e38))] * count
         for number, (dx, dy) in enumerate(offsets.tolist()):
             distance = _distance(near, dx, dy) + _NORMAL
             key = jax.lax.bitcast_convert_type(distance, jnp.int32) >> bits << bits
@@ -234,7 +228,7 @@ def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -
             for slot in range(count):  # insertion; where() is one instruction here, jnp.minimum is several
                 closer = best[slot] < key
                 best[slot], key = jnp.where(closer, best[slot], key), jnp.where(closer, key, best[slot])
-        tags = [jax.lax.bitcast_convert_type(b, jnp.uint32) & mask for b in best]
+        tags = [jnp.where(_usable(near), jax.lax.bitcast_convert_type(b, jnp.uint32) & mask, 0) for b in best]
         shifted = [tag << np.uint32(i % per_word * bits) for i, tag in enumerate(tags)]
         return [
             functools.reduce(jnp.bitwise_or, shifted[i : i + per_word]) for i in range(0, count, per_word)
@@ -242,7 +236,7 @@ def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -
 
     # A loop that runs once, which the compiler cannot know: without it, it would copy all of the above into
     # each place that reads a winner.
-    blank = [jnp.zeros(near.x.shape, jnp.uint32) for _ in range(0, count, per_word)]
+    blank = [jnp.zeros(shape, jnp.uint32) for _ in range(0, count, per_word)]
     packed = jax.lax.while_loop(
         lambda s: s[0], lambda s: (jnp.zeros_like(s[0]), words()), (_opaque_true(near), blank)
     )[1]
@@ -258,16 +252,13 @@ def _filter(
 ) -> tuple[Float[Array, "h w c"], Float[Array, "h w 1"]]:
     """The normalised sum over the kept candidates, and the confidence. Plain differentiable code."""
     h, w, channels = value.shape
-    # Where nothing is valid the first slot holds the centre, whose clamped pixel is the fallback.
-    kept = [jnp.where(near.usable, kept[0], 0), *kept[1:]]
     steps = [(jnp.asarray(offsets[:, 0])[number], jnp.asarray(offsets[:, 1])[number]) for number in kept]
-
     distances = jax.lax.cond(  # again only to have them computed once
         _opaque_true(near),
-        lambda: [_distance(near, dx, dy) for dx, dy in steps],
+        lambda: [jnp.where(_usable(near), _distance(near, dx, dy), _NOWHERE) for dx, dy in steps],
         lambda: [jnp.zeros((h, w)) for _ in steps],
     )
-    valid = near.usable & (distances[0] < _NOWHERE)
+    valid = distances[0] < _NOWHERE
     # The first is the heaviest but for near-ties; the limit (not 0, where its gradient would be halved) only
     # acts on those of weights below exp(-10^6).
     nearest = jax.lax.stop_gradient(distances[0])
@@ -275,13 +266,15 @@ def _filter(
     weights = [
         jnp.where(valid & (d < _NOWHERE), weight, 0) for weight, d in zip(weights, distances, strict=True)
     ]
+    # Where nothing is valid all are equal, and the first is the centre: its clamped pixel is the fallback.
     weights[0] = jnp.where(valid, weights[0], 1)
     total = functools.reduce(jnp.add, weights)
 
     pixels = value.reshape(h * w, channels)
     image = jnp.zeros(value.shape, jnp.float32)
+    x, y, _, _ = _centre(near)
     for (dx, dy), weight in zip(steps, weights, strict=True):
-        index = jnp.clip(near.y + dy, 0, h - 1) * w + jnp.clip(near.x + dx, 0, w - 1)
+        index = jnp.clip(y + dy, 0, h - 1) * w + jnp.clip(x + dx, 0, w - 1)
         pixel = pixels.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds").astype(jnp.float32)
         # What weighs nothing may not be a number: a pixel without a guide may have no colour either.
         image = image + jnp.where((weight > 0)[..., None], pixel, 0) * weight[..., None]
@@ -290,4 +283,4 @@ def _filter(
 
 
 def _opaque_true(near: _Neighbourhood) -> Bool[Array, ""]:
-    return near.x[0, 0] < np.int32(2**31 - 1)
+    return _centre(near)[0][0, 0] < np.int32(2**31 - 1)

@@ -1,0 +1,169 @@
+"""The numbers and pictures of README, from the sample that ships with the package.
+
+    python experiments/demo_results.py
+
+Runs the demo at x2 and x4; writes experiments/results/demo.json (every metric of every frame), demo.md (the
+tables of README) and docs/images/demo_<task>.png (crops: input, methods, truth).
+"""
+
+import json
+import platform
+import subprocess
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import tyro
+from PIL import Image, ImageDraw, ImageFont
+
+from jaxsr.cli import _progress
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.demo import description, run_demo
+from jaxsr.evaluation.sample import unpack_sample
+from jaxsr.evaluation.tables import Section, as_json, best, cell, duration, header, summary
+from jaxsr.io.exr import atomic_path
+from jaxsr.io.images import write_png
+
+ROOT = Path(__file__).resolve().parent.parent
+RESULTS = ROOT / "experiments" / "results"
+IMAGES = ROOT / "docs" / "images"
+
+LABELS = {
+    "super-resolution": {},
+    "extrapolation": {
+        "nearest": "nearest, last frame held",
+        "bilinear": "bilinear, last frame held",
+        "taau": "taau, plain warp",
+    },
+}
+CROP = (64, 40)
+
+
+@dataclass(frozen=True)
+class Config:
+    scales: tuple[int, ...] = (2, 4)
+    frame: int = 6
+    """The frame shown in the pictures; even frames are extrapolated."""
+
+
+def task_of(section: Section) -> str:
+    return "extrapolation" if any(section.extrapolated) else "super-resolution"
+
+
+def table(sections: list[Section], task: str) -> list[str]:
+    """One table a task: every metric of every method, a block of lines for each scene."""
+    chosen = [s for s in sections if task_of(s) == task]
+    keys = chosen[0].metric_keys()
+    lines = [
+        "| scene | method | " + " | ".join(header(k) for k in keys) + " | ms a frame |",
+        "|---|---|" + "---:|" * (len(keys) + 1),
+    ]
+    for section in chosen:
+        subset = section.subsets()["extrapolated" if task == "extrapolation" else "all"]
+        for track in section.tracks:
+            cells = []
+            for key in keys:
+                text = cell(summary(track, key, subset), key)
+                cells.append(f"**{text}**" if track.name in best(section, key, subset) else text)
+            name = LABELS[task].get(track.name, track.name)
+            time_ms = duration(track.timing.median_ms) if track.timing else ""
+            scene = str(section.meta["sequence"]).split("-")[0]
+            lines.append(f"| {scene} x{section.meta['scale']} | {name} | {' | '.join(cells)} | {time_ms} |")
+    return lines
+
+
+def busiest(truth: np.ndarray, rivals: list[np.ndarray]) -> tuple[int, int]:
+    """Top left of the crop where the methods differ most from the truth in sum: the same crop for all."""
+    error = sum(((np.asarray(r) - truth) ** 2).sum(-1) for r in rivals)
+    total = np.pad(np.cumsum(np.cumsum(error, 0), 1), ((1, 0), (1, 0)))
+    w, h = CROP
+    sums = total[h:, w:] - total[:-h, w:] - total[h:, :-w] + total[:-h, :-w]
+    y, x = np.unravel_index(np.argmax(sums), sums.shape)
+    return int(x), int(y)
+
+
+def strip(section: Section, frame: int) -> np.ndarray:
+    """The truth with the crop marked, then the crop of the input, each method and the truth, enlarged."""
+    i = list(section.frames).index(frame)
+    truth = np.asarray(section.truths[i])
+    tracks = [t for t in section.tracks if t.name not in ("nearest", "bicubic")]
+    images = {LABELS[task_of(section)].get(t.name, t.name): np.asarray(t.images[i]) for t in tracks}
+    x, y = busiest(truth, list(images.values()))
+    (w, h), zoom = CROP, 4
+    given = section.inputs[i]
+    low = None if given is None else np.asarray(given)
+    if low is not None:
+        s = truth.shape[0] // low.shape[0]
+        images = {"input": low.repeat(s, 0).repeat(s, 1), **images}
+    images["truth"] = truth
+    height = h * zoom
+    whole = Image.fromarray(np.rint(truth * 255).astype(np.uint8))
+    ImageDraw.Draw(whole).rectangle((x - 1, y - 1, x + w, y + h), outline=(255, 60, 60))
+    whole = whole.resize((round(truth.shape[1] * height / truth.shape[0]), height), Image.Resampling.LANCZOS)
+    tiles = [(str(section.meta["sequence"]).split("-")[0], whole)]
+    for name, image in images.items():
+        crop = Image.fromarray(np.rint(image[y : y + h, x : x + w] * 255).astype(np.uint8))
+        tiles.append((name, crop.resize((w * zoom, height), Image.Resampling.NEAREST)))
+    sheet = Image.new("RGB", (sum(t.width + 4 for _, t in tiles), height + 22), (255, 255, 255))
+    font = ImageFont.load_default(14)
+    left = 0
+    for name, tile in tiles:
+        ImageDraw.Draw(sheet).text((left + 2, 2), name, fill=(0, 0, 0), font=font)
+        sheet.paste(tile, (left, 22))
+        left += tile.width + 4
+    return np.asarray(sheet)
+
+
+def picture(sections: list[Section], task: str, frame: int) -> np.ndarray:
+    rows = [strip(s, frame) for s in sections if task_of(s) == task]
+    width = max(r.shape[1] for r in rows)
+    return np.concatenate(
+        [np.pad(r, ((0, 4), (0, width - r.shape[1]), (0, 0)), constant_values=255) for r in rows]
+    )
+
+
+def main(config: Config) -> None:
+    start = time.time()
+    sections: list[Section] = []
+    with tempfile.TemporaryDirectory() as folder, _progress() as progress:
+        for scale in config.scales:
+            paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)
+            sections += run_demo(Path(folder) / f"x{scale}", paths, scale=scale, progress=progress)
+    commit = subprocess.run(
+        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
+    ).stdout.strip()
+    meta = description(
+        commit=commit,
+        processor=platform.processor() or platform.machine(),
+        seconds=round(time.time() - start),
+        seed="none: nothing is random",
+        script="experiments/demo_results.py",
+        scales=config.scales,
+    )
+    RESULTS.mkdir(parents=True, exist_ok=True)
+    with atomic_path(RESULTS / "demo.json") as temporary:
+        document = as_json(sections, title="demo", meta=meta)
+        temporary.write_text(json.dumps(document, indent=1) + "\n")
+    lines = [
+        f"Measured by `experiments/demo_results.py` at {commit} on {meta['date']} ({meta['device']}, jax "
+        f"{meta['jax']}): mean ± standard deviation over frames. Display-referred colour, no crop.",
+        "",
+    ]
+    for task in LABELS:
+        which = "extrapolated frames only" if task == "extrapolation" else "all frames"
+        lines += [f"{task.capitalize()}, {which}:", "", *table(sections, task), ""]
+    with atomic_path(RESULTS / "demo.md") as temporary:
+        temporary.write_text("\n".join(lines))
+    for task in LABELS:
+        shown = [s for s in sections if s.meta["scale"] == (4 if task == "super-resolution" else 2)]
+        write_png(IMAGES / f"demo_{task}.png", picture(shown, task, config.frame))
+    print("\n".join(lines))
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config))
+    except JaxsrError as error:
+        raise SystemExit(f"demo_results: {error}") from None
