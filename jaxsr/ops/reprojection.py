@@ -29,7 +29,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.ops._batch import over_batch
 
 DEFAULT_SIGMA_GUIDE = 0.15
-"""Standard deviation of guide differences; for base colour and unit normals (experiments/tune_classical.py)."""
+"""Standard deviation of guide differences: base colour, unit normals (experiments/tune_classical.py)."""
 DEFAULT_SIGMA_SPACE = 2.0
 """Standard deviation of the distance to xbar, in pixels (likewise)."""
 
