@@ -81,7 +81,7 @@ def demo(
         sequences = unpack_sample(out / "sample", "test", scenes, progress)
         sections = run_demo(out, sequences, scale=scale, progress=progress)
     console = Console()
-    for table in rich_tables(sections):
+    for table in rich_tables(sections, brief=True):
         console.print(table)
     print(f"Open {out / 'report.html'}; frames, videos and metrics.json are beside it.")
 

@@ -322,7 +322,7 @@
     $("ticks").innerHTML = s.extrapolated.map((x, i) => `<i class="${x ? "x" : ""}${s.embedded[i] ? "" : " empty"}"></i>`).join("");
     s.columns = ["psnr", "flip"].filter((k) => s.tracks.some((t) => t.metrics[k]));
     $("sources").innerHTML = `<thead><tr><th scope="col">Compare</th><th scope="col">Left</th><th scope="col">Right</th>${s.columns.map((k) => `<th scope="col" class="n">${escape(data.metrics[k].label)}</th>`).join("")}</tr></thead><tbody>` + s.sources.map((t) =>
-      `<tr data-key="${escape(t.key)}"><td><div><span class="swatch ${t.metrics ? "" : "none"}" style="--c:${t.color}"></span><span>${escape(t.name)}${t.note ? `<small>${escape(t.note)}</small>` : ""}</span></div></td>` +
+      `<tr data-key="${escape(t.key)}"><td title="${escape(t.note || "")}"><div><span class="swatch ${t.metrics ? "" : "none"}" style="--c:${t.color}"></span><span>${escape(t.name)}${t.note && !t.metrics ? `<small>${escape(t.note)}</small>` : ""}</span></div></td>` +
       ["left", "right"].map((side) => `<td><input type="radio" name="${side}" value="${escape(t.key)}" aria-label="${escape(t.name)} on the ${side}"></td>`).join("") + s.columns.map(() => '<td class="n"></td>').join("") + "</tr>").join("") + "</tbody>";
     for (const el of document.querySelectorAll(".result")) {
       el.querySelectorAll("tbody tr").forEach((row, i) => {

@@ -16,6 +16,7 @@ import io
 import json
 import math
 from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -147,9 +148,13 @@ def measured(
         images, truths: display-referred float images [H, W, 3], one pair a frame.
         starts: True where a frame does not follow the one before it.
     """
-    maps = [flip_map(a, b) for a, b in zip(images, truths, strict=True)]
+    if len(images) != len(truths):
+        raise JaxsrError("unequal number of frames", where=name, expected=len(truths), found=len(images))
+    with ThreadPoolExecutor() as pool:  # FLIP is most of the time, and runs outside the interpreter's lock
+        maps = list(pool.map(flip_map, images, truths))
+        small = list(pool.map(flip_jpeg, maps)) if flip_maps else ()
     found = measure(images, truths, starts=starts, flip_maps=maps)
-    return Track(name, images, found, timing, note, [flip_jpeg(m) for m in maps] if flip_maps else ())
+    return Track(name, images, found, timing, note, small)
 
 
 def summarise(values: Values) -> Summary:

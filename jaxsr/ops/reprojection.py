@@ -97,7 +97,7 @@ def reproject(
         there = _padded(g_prev, scale, pad=2 * int(np.abs(offsets).max()) + 1)
         near = _Neighbourhood(motion, g, there, scale, scale_space)
         kept = _select(jax.lax.stop_gradient(near), offsets, min(count, len(offsets)))
-        return _filter(value, near, offsets, kept)
+        return _filter(value, near, jnp.asarray(offsets)[kept])
 
     return over_batch(one, previous, motion_px, guide, previous_guide)
 
@@ -189,11 +189,15 @@ def _usable(near: _Neighbourhood) -> Bool[Array, "h w"]:
     return functools.reduce(jnp.logical_and, finite) & _known(near.motion)
 
 
-def _distance(near: _Neighbourhood, dx: Array | int, dy: Array | int) -> Float[Array, "h w"]:
-    """Minus the logarithm of w_x(y) / G(xbar - [xbar]) for y = [xbar] + (dx, dy); never negative."""
+def _distance(near: _Neighbourhood, dx: Array | int, dy: Array | int) -> Float[Array, "h w *k"]:
+    """Minus the logarithm of w_x(y) / G(xbar - [xbar]) for y = [xbar] + (dx, dy); never negative.
+
+    The offsets are the same for all pixels, or `[H, W, K]`.
+    """
     h, w, channels = near.guide.shape
     hp, wp, _ = near.there.shape
-    x, y, fx, fy = _centre(near)
+    axes = range(2, 2 + max(jnp.ndim(dx) - 2, 0))
+    x, y, fx, fy, usable = (jnp.expand_dims(a, axes) for a in (*_centre(near), _usable(near)))
     corner = (y + (hp - h) // 2) * wp + x + (wp - w) // 2
     # Unsigned: a signed index would be tested for being negative.
     row = near.there.reshape(-1, channels).at[(corner + (dy * wp + dx)).astype(jnp.uint32)]
@@ -201,14 +205,13 @@ def _distance(near: _Neighbourhood, dx: Array | int, dy: Array | int) -> Float[A
     # |xbar - y|^2 - |xbar - [xbar]|^2, free of cancellation.
     sx, sy = jnp.asarray(dx, jnp.float32), jnp.asarray(dy, jnp.float32)
     distance = (sx * (2 * fx + sx) + sy * (2 * fy + sy)) * jnp.square(near.scale_space)
-    usable = _usable(near)
     for c in range(channels):
-        here = jnp.where(usable, near.guide[..., c], 0).astype(jnp.float32) * near.scale[c]
-        distance = distance + jnp.square(jnp.clip(here, -_CLIP, _CLIP) - there[..., c])
+        here = jnp.where(usable, jnp.expand_dims(near.guide[..., c], axes), 0).astype(jnp.float32)
+        distance = distance + jnp.square(jnp.clip(here * near.scale[c], -_CLIP, _CLIP) - there[..., c])
     return distance
 
 
-def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -> list[Int[Array, "h w"]]:
+def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -> Int[Array, "h w k"]:
     """Numbers of the `count` heaviest candidates, heaviest first.
 
     Keys are distances whose last bits are replaced by the candidate's number. The winners are packed into
@@ -240,46 +243,43 @@ def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -
     packed = jax.lax.while_loop(
         lambda s: s[0], lambda s: (jnp.zeros_like(s[0]), words()), (_opaque_true(near), blank)
     )[1]
-    numbers = [(packed[i // per_word] >> np.uint32(i % per_word * bits)) & mask for i in range(count)]
-    return [number.astype(jnp.int32) for number in numbers]
+    shifts = jnp.arange(per_word, dtype=jnp.uint32) * np.uint32(bits)
+    numbers = [(word[..., None] >> shifts[None, None, :]) & mask for word in packed]
+    return jnp.concatenate(numbers, -1)[..., :count].astype(jnp.int32)
 
 
 def _filter(
-    value: Float[Array, "h w c"],
-    near: _Neighbourhood,
-    offsets: Int[np.ndarray, "n 2"],
-    kept: list[Int[Array, "h w"]],
+    value: Float[Array, "h w c"], near: _Neighbourhood, kept: Int[Array, "h w k 2"]
 ) -> tuple[Float[Array, "h w c"], Float[Array, "h w 1"]]:
-    """The normalised sum over the kept candidates, and the confidence. Plain differentiable code."""
+    """The normalised sum over the candidates at the kept offsets, and the confidence. Differentiable."""
     h, w, channels = value.shape
-    steps = [(jnp.asarray(offsets[:, 0])[number], jnp.asarray(offsets[:, 1])[number]) for number in kept]
-    distances = jax.lax.cond(  # again only to have them computed once
+    count = kept.shape[2]
+    dx, dy = kept[..., 0], kept[..., 1]
+    distance = jax.lax.cond(  # again only to have them computed once
         _opaque_true(near),
-        lambda: [jnp.where(_usable(near), _distance(near, dx, dy), _NOWHERE) for dx, dy in steps],
-        lambda: [jnp.zeros((h, w)) for _ in steps],
+        lambda: jnp.where(_usable(near)[..., None], _distance(near, dx, dy), _NOWHERE),
+        lambda: jnp.zeros((h, w, count)),
     )
-    valid = distances[0] < _NOWHERE
+    valid = distance[..., :1] < _NOWHERE
     # The first is the heaviest but for near-ties; the limit (not 0, where its gradient would be halved) only
     # acts on those of weights below exp(-10^6).
-    nearest = jax.lax.stop_gradient(distances[0])
-    weights = [jnp.exp(jnp.minimum(nearest - d, 10)) for d in distances]
-    weights = [
-        jnp.where(valid & (d < _NOWHERE), weight, 0) for weight, d in zip(weights, distances, strict=True)
-    ]
+    nearest = jax.lax.stop_gradient(distance[..., :1])
+    weight = jnp.exp(jnp.minimum(nearest - distance, 10))
+    weight = jnp.where(valid & (distance < _NOWHERE), weight, 0)
     # Where nothing is valid all are equal, and the first is the centre: its clamped pixel is the fallback.
-    weights[0] = jnp.where(valid, weights[0], 1)
-    total = functools.reduce(jnp.add, weights)
+    weight = jnp.where(valid | (jnp.arange(count) > 0)[None, None, :], weight, 1)
 
     pixels = value.reshape(h * w, channels)
-    image = jnp.zeros(value.shape, jnp.float32)
+    image, total = jnp.zeros(value.shape, jnp.float32), jnp.zeros((h, w, 1))
     x, y, _, _ = _centre(near)
-    for (dx, dy), weight in zip(steps, weights, strict=True):
-        index = jnp.clip(y + dy, 0, h - 1) * w + jnp.clip(x + dx, 0, w - 1)
+    for k in range(count):
+        index = jnp.clip(y + dy[..., k], 0, h - 1) * w + jnp.clip(x + dx[..., k], 0, w - 1)
         pixel = pixels.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds").astype(jnp.float32)
         # What weighs nothing may not be a number: a pixel without a guide may have no colour either.
-        image = image + jnp.where((weight > 0)[..., None], pixel, 0) * weight[..., None]
-    confidence = jnp.where(valid, jnp.exp(-distances[0]), 0)
-    return (image / total[..., None]).astype(value.dtype), confidence[..., None]
+        image = image + jnp.where(weight[..., k, None] > 0, pixel, 0) * weight[..., k, None]
+        total = total + weight[..., k, None]
+    confidence = jnp.where(valid, jnp.exp(-distance[..., :1]), 0)
+    return (image / total).astype(value.dtype), confidence
 
 
 def _opaque_true(near: _Neighbourhood) -> Bool[Array, ""]:
