@@ -239,14 +239,17 @@ def rows(
     return columns, cells, marks
 
 
-def rich_tables(sections: Sequence[Section]) -> list[Table]:
+def rich_tables(sections: Sequence[Section], brief: bool = False) -> list[Table]:
     """One table of means a section and subset for the terminal, best values bold and green.
 
     A star: identical frames, whose PSNR is infinite, are not in the mean.
+
+    Args:
+        brief: only the first subset of each section: the extrapolated frames where there are any, else all.
     """
     tables = []
     for section in sections:
-        for subset, positions in section.subsets().items():
+        for subset, positions in list(section.subsets().items())[: 1 if brief else None]:
             columns, cells, marks = rows(section, subset, spread=False)
             title = f"{escape(section.title)} · {subset} ({len(positions)} frames)"
             table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD)
