@@ -61,16 +61,27 @@ def run_demo(
     write_report(out / "report.html", sections, title="jaxsr demo", meta=meta)
     write_metrics(out, sections, title="jaxsr demo", meta=meta)
     advance = progress("videos", len(sections))
-    fps = opened[0].fps / 3  # slow motion: the sample is short
-    for section, (sequence, (task, _, _)) in zip(
-        sections, [(s, t) for s in opened for t in tasks], strict=True
-    ):
-        shown = {"input": _enlarged(section), **{t.name: t.images for t in section.tracks[-2:]}}
-        shown["truth"] = section.truths
-        columns = {label: [np.asarray(image) for image in images] for label, images in shown.items()}
-        write_video(out / f"{sequence.name}-{task}.mp4", columns, fps=fps)
+    names = [
+        (s, task, rival)
+        for s in opened
+        for task, rival in (("super-resolution", "bilinear"), ("extrapolation", "taau"))
+    ]
+    for section, (sequence, task, rival) in zip(sections, names, strict=True):
+        _write_video(out / f"{sequence.name}-{task}.mp4", section, (rival, "guided-taau"), sequence.fps / 3)
         advance()
     return sections
+
+
+def _write_video(path: Path, section: Section, names: Sequence[str], fps: float) -> None:
+    """Input, two methods and truth, two by two; the clip is short and plays four times."""
+    tracks = {t.name: t.images for t in section.tracks}
+    shown = {"input": _enlarged(section), **{n: tracks[n] for n in names}, "truth": section.truths}
+    extrapolated = section.extrapolated or [False] * len(section.frames)
+    captions = [
+        f"frame {n}{', extrapolated' if e else ''}" for n, e in zip(section.frames, extrapolated, strict=True)
+    ]
+    columns = {label: [np.asarray(image) for image in images] * 4 for label, images in shown.items()}
+    write_video(path, columns, fps=fps, per_row=2, captions=captions * 4)
 
 
 def _enlarged(section: Section) -> list[np.ndarray]:
