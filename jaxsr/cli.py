@@ -78,7 +78,7 @@ def demo(
     from jaxsr.evaluation.tables import rich_tables
 
     with _progress() as progress:
-        sequences = unpack_sample(out / "sample", "test", scenes, progress)
+        sequences = unpack_sample(out / "sample", "test", scenes, scale, progress)
         sections = run_demo(out, sequences, scale=scale, progress=progress)
     console = Console()
     for table in rich_tables(sections, brief=True):

@@ -34,7 +34,7 @@ def demo(tmp_path_factory):
 def test_the_demo_writes_frames_videos_metrics_and_a_page(demo):
     out, sections, steps = demo
     assert len(sections) == 4
-    assert steps.count("frames") == 4 * 2 * (4 + 4)
+    assert steps.count("frames") == 2 * 4 * (5 + 5)
     for name in ("one-test-0", "two-test-0"):
         for task in ("super-resolution", "extrapolation"):
             assert (out / f"{name}-{task}.mp4").stat().st_size > 1000

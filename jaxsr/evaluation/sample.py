@@ -35,6 +35,7 @@ def unpack_sample(
     out: Path,
     split: str,
     scenes: tuple[str, ...] = (),
+    scale: int = 1,
     progress: Callable[[str, int], Callable[[], Any]] = lambda title, total: lambda: None,
 ) -> list[Path]:
     """Unpack the sequences of a split to `out/<name>`; what is there already is kept.
@@ -42,13 +43,14 @@ def unpack_sample(
     Args:
         split: "test" or "train".
         scenes: names; all by default.
+        scale: one that the sequences must have.
         progress: called with a title and a number of steps; returns what is called after each step.
 
     Returns:
         The folders, one a sequence.
 
     Raises:
-        JaxsrError: no such scene or split, no sample, or a damaged archive.
+        JaxsrError: no such scene, split or scale, no sample, or a damaged archive.
     """
     known = sample_scenes()
     unknown = sorted(set(scenes) - set(known))
@@ -61,6 +63,10 @@ def unpack_sample(
         found += [(archive, manifest, n) for n in manifest["sequences"] if f"-{split}-" in n]
     if not found:
         raise JaxsrError("no such part of the sample", where="split", expected="test or train", found=split)
+    for archive, manifest, name in found:
+        scales = [1, *manifest["sequences"][name]["scales"]]
+        if scale not in scales:
+            raise JaxsrError(f"scale {scale} is not available", where=archive, expected=f"one of {scales}")
     advance = progress("unpack", len(found))
     folders = []
     for archive, manifest, name in found:
