@@ -53,7 +53,7 @@ def test_a_sequence_of_the_sample_reads_as_any_other(tmp_path):
 
 
 def test_errors(tmp_path):
-    with pytest.raises(JaxsrError, match="no scene 'moon'; expected bunker, docks, forest"):
+    with pytest.raises(JaxsrError, match="no scene 'moon' in the sample; expected bunker, docks, forest"):
         sample.unpack_sample(tmp_path, "test", ("moon",))
     with pytest.raises(JaxsrError, match="no such part of the sample"):
         sample.unpack_sample(tmp_path, "validation")
