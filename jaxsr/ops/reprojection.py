@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxsr.errors import JaxsrError
 from jaxsr.ops._batch import over_batch
@@ -97,7 +97,7 @@ def reproject(
         there = _padded(g_prev, scale, pad=2 * int(np.abs(offsets).max()) + 1)
         near = _Neighbourhood(motion, g, there, scale, scale_space)
         kept = _select(jax.lax.stop_gradient(near), offsets, min(count, len(offsets)))
-        return _filter(value, near, jnp.asarray(offsets)[kept])
+        return _filter(value, near, kept, offsets, min(count, len(offsets)))
 
     return over_batch(one, previous, motion_px, guide, previous_guide)
 
@@ -183,83 +183,115 @@ def _known(motion: Float[Array, "h w 2"]) -> Bool[Array, "h w"]:
     return ~(jnp.isnan(motion[..., 0]) | jnp.isnan(motion[..., 1]))
 
 
-def _usable(near: _Neighbourhood) -> Bool[Array, "h w"]:
+class _Pixel(NamedTuple):
+    """What all candidates of a pixel share. Cheap: computed in each loop rather than stored between them."""
+
+    corner: Int[Array, "h w *k"]
+    """Index of [xbar] in the padded guide."""
+    fx: Float[Array, "h w *k"]
+    fy: Float[Array, "h w *k"]
+    here: list[Float[Array, "h w *k"]]
+    usable: Bool[Array, "h w *k"]
     """False where the pixel's own guide or motion is not finite."""
-    finite = [jnp.isfinite(near.guide[..., c]) for c in range(near.guide.shape[-1])]
-    return functools.reduce(jnp.logical_and, finite) & _known(near.motion)
 
 
-def _distance(near: _Neighbourhood, dx: Array | int, dy: Array | int) -> Float[Array, "h w *k"]:
-    """Minus the logarithm of w_x(y) / G(xbar - [xbar]) for y = [xbar] + (dx, dy); never negative.
-
-    The offsets are the same for all pixels, or `[H, W, K]`.
-    """
+def _pixel(near: _Neighbourhood) -> _Pixel:
     h, w, channels = near.guide.shape
     hp, wp, _ = near.there.shape
-    axes = range(2, 2 + max(jnp.ndim(dx) - 2, 0))
-    x, y, fx, fy, usable = (jnp.expand_dims(a, axes) for a in (*_centre(near), _usable(near)))
-    corner = (y + (hp - h) // 2) * wp + x + (wp - w) // 2
+    x, y, fx, fy = _centre(near)
+    planes = [near.guide[..., c] for c in range(channels)]
+    usable = functools.reduce(jnp.logical_and, map(jnp.isfinite, planes)) & _known(near.motion)
+    here = [
+        jnp.clip(jnp.where(usable, plane, 0).astype(jnp.float32) * near.scale[c], -_CLIP, _CLIP)
+        for c, plane in enumerate(planes)
+    ]
+    return _Pixel((y + (hp - h) // 2) * wp + x + (wp - w) // 2, fx, fy, here, usable)
+
+
+def _distance(
+    near: _Neighbourhood, pixel: _Pixel, dx: Array | int, dy: Array | int
+) -> Float[Array, "h w *k"]:
+    """Minus the logarithm of w_x(y) / G(xbar - [xbar]) for y = [xbar] + (dx, dy); never negative."""
+    _, wp, channels = near.there.shape
     # Unsigned: a signed index would be tested for being negative.
-    row = near.there.reshape(-1, channels).at[(corner + (dy * wp + dx)).astype(jnp.uint32)]
+    row = near.there.reshape(-1, channels).at[(pixel.corner + (dy * wp + dx)).astype(jnp.uint32)]
     there = row.get(mode="promise_in_bounds")
     # |xbar - y|^2 - |xbar - [xbar]|^2, free of cancellation.
     sx, sy = jnp.asarray(dx, jnp.float32), jnp.asarray(dy, jnp.float32)
-    distance = (sx * (2 * fx + sx) + sy * (2 * fy + sy)) * jnp.square(near.scale_space)
-    for c in range(channels):
-        here = jnp.where(usable, jnp.expand_dims(near.guide[..., c], axes), 0).astype(jnp.float32)
-        distance = distance + jnp.square(jnp.clip(here * near.scale[c], -_CLIP, _CLIP) - there[..., c])
+    distance = (sx * (2 * pixel.fx + sx) + sy * (2 * pixel.fy + sy)) * jnp.square(near.scale_space)
+    for c, here in enumerate(pixel.here):
+        distance = distance + jnp.square(here - there[..., c])
     return distance
 
 
-def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -> Int[Array, "h w k"]:
-    """Numbers of the `count` heaviest candidates, heaviest first.
+def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -> list[UInt32[Array, "h w"]]:
+    """Numbers of the `count` heaviest candidates, heaviest first, packed into as few words as they need.
 
-    Keys are distances whose last bits are replaced by the candidate's number. The winners are packed into
-    as few words as they need: one output lets XLA compile everything here to one loop over pixels that
-    keeps the candidates in registers, where several outputs would each repeat the gathers.
+    Keys are distances whose last bits are replaced by the candidate's number. One word is one output, which
+    lets XLA compile everything here to one loop over pixels that keeps the candidates in registers; several
+    outputs would each repeat the gathers.
     """
-    bits = max(1, (len(offsets) - 1).bit_length())
-    per_word, mask = 32 // bits, np.uint32((1 << bits) - 1)
+    bits = _tag_bits(offsets)
     shape = near.motion.shape[:2]
 
     def words() -> list[Array]:
+        pixel = _pixel(near)
         best = [jnp.full(shape, np.float32(3e38))] * count
         for number, (dx, dy) in enumerate(offsets.tolist()):
-            distance = _distance(near, dx, dy) + _NORMAL
+            distance = _distance(near, pixel, dx, dy) + _NORMAL
             key = jax.lax.bitcast_convert_type(distance, jnp.int32) >> bits << bits
             key = jax.lax.bitcast_convert_type(key | number, jnp.float32)
             for slot in range(count):  # insertion; where() is one instruction here, jnp.minimum is several
                 closer = best[slot] < key
                 best[slot], key = jnp.where(closer, best[slot], key), jnp.where(closer, key, best[slot])
-        tags = [jnp.where(_usable(near), jax.lax.bitcast_convert_type(b, jnp.uint32) & mask, 0) for b in best]
-        shifted = [tag << np.uint32(i % per_word * bits) for i, tag in enumerate(tags)]
+        tags = [jax.lax.bitcast_convert_type(b, jnp.uint32) & np.uint32((1 << bits) - 1) for b in best]
+        tags = [
+            jnp.where(pixel.usable, tag, 0) << np.uint32(i % (32 // bits) * bits)
+            for i, tag in enumerate(tags)
+        ]
         return [
-            functools.reduce(jnp.bitwise_or, shifted[i : i + per_word]) for i in range(0, count, per_word)
+            functools.reduce(jnp.bitwise_or, tags[i : i + 32 // bits]) for i in range(0, count, 32 // bits)
         ]
 
     # A loop that runs once, which the compiler cannot know: without it, it would copy all of the above into
     # each place that reads a winner.
-    blank = [jnp.zeros(shape, jnp.uint32) for _ in range(0, count, per_word)]
-    packed = jax.lax.while_loop(
+    blank = [jnp.zeros(shape, jnp.uint32) for _ in range(0, count, 32 // bits)]
+    return jax.lax.while_loop(
         lambda s: s[0], lambda s: (jnp.zeros_like(s[0]), words()), (_opaque_true(near), blank)
     )[1]
-    shifts = jnp.arange(per_word, dtype=jnp.uint32) * np.uint32(bits)
-    numbers = [(word[..., None] >> shifts[None, None, :]) & mask for word in packed]
-    return jnp.concatenate(numbers, -1)[..., :count].astype(jnp.int32)
+
+
+def _unpack(
+    words: list[UInt32[Array, "h w"]], offsets: Int[np.ndarray, "n 2"], count: int
+) -> tuple[Int[Array, "h w k"], Int[Array, "h w k"]]:
+    """The offsets (dx, dy) that the words stand for."""
+    bits = _tag_bits(offsets)
+    shifts = np.arange(32 // bits, dtype=np.uint32) * np.uint32(bits)
+    tags = [(word[..., None] >> shifts[None, None, :]) & np.uint32((1 << bits) - 1) for word in words]
+    number = jnp.concatenate(tags, -1)[..., :count] if len(tags) > 1 else tags[0][..., :count]
+    return jnp.asarray(offsets[:, 0])[number], jnp.asarray(offsets[:, 1])[number]
+
+
+def _tag_bits(offsets: Int[np.ndarray, "n 2"]) -> int:
+    return max(1, (len(offsets) - 1).bit_length())
 
 
 def _filter(
-    value: Float[Array, "h w c"], near: _Neighbourhood, kept: Int[Array, "h w k 2"]
+    value: Float[Array, "h w c"],
+    near: _Neighbourhood,
+    words: list[UInt32[Array, "h w"]],
+    offsets: Int[np.ndarray, "n 2"],
+    count: int,
 ) -> tuple[Float[Array, "h w c"], Float[Array, "h w 1"]]:
-    """The normalised sum over the candidates at the kept offsets, and the confidence. Differentiable."""
+    """The normalised sum over the selected candidates, and the confidence. Plain differentiable code."""
     h, w, channels = value.shape
-    count = kept.shape[2]
-    dx, dy = kept[..., 0], kept[..., 1]
-    distance = jax.lax.cond(  # again only to have them computed once
-        _opaque_true(near),
-        lambda: jnp.where(_usable(near)[..., None], _distance(near, dx, dy), _NOWHERE),
-        lambda: jnp.zeros((h, w, count)),
-    )
+
+    def distances() -> Array:
+        pixel = jax.tree.map(lambda a: a[..., None], _pixel(near))
+        return jnp.where(pixel.usable, _distance(near, pixel, *_unpack(words, offsets, count)), _NOWHERE)
+
+    # Again only to have them computed once.
+    distance = jax.lax.cond(_opaque_true(near), distances, lambda: jnp.zeros((h, w, count)))
     valid = distance[..., :1] < _NOWHERE
     # The first is the heaviest but for near-ties; the limit (not 0, where its gradient would be halved) only
     # acts on those of weights below exp(-10^6).
@@ -267,11 +299,12 @@ def _filter(
     weight = jnp.exp(jnp.minimum(nearest - distance, 10))
     weight = jnp.where(valid & (distance < _NOWHERE), weight, 0)
     # Where nothing is valid all are equal, and the first is the centre: its clamped pixel is the fallback.
-    weight = jnp.where(valid | (jnp.arange(count) > 0)[None, None, :], weight, 1)
+    weight = jnp.where(valid | (np.arange(count) > 0)[None, None, :], weight, 1)
 
     pixels = value.reshape(h * w, channels)
     image, total = jnp.zeros(value.shape, jnp.float32), jnp.zeros((h, w, 1))
     x, y, _, _ = _centre(near)
+    dx, dy = _unpack(words, offsets, count)
     for k in range(count):
         index = jnp.clip(y + dy[..., k], 0, h - 1) * w + jnp.clip(x + dx[..., k], 0, w - 1)
         pixel = pixels.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds").astype(jnp.float32)
