@@ -227,6 +227,14 @@ def test_jit_and_batch():
     assert_jit_and_batch(lambda *a: reproject(*a, **SIGMAS, strides=(1,)), *batch)
 
 
+def test_memory_stays_far_below_a_gather_of_all_candidates():
+    # Also guards the speed: when the compiler copies the selection into its readers, memory is the first sign.
+    inputs = _inputs(20, 64, 96, g=6)
+    compiled = jax.jit(reproject).lower(*inputs).compile()
+    temporary = compiled.memory_analysis().temp_size_in_bytes / (64 * 96)
+    assert temporary < 250  # bytes a pixel, 100 of them the padding; all candidates' guides alone are 800
+
+
 def test_half_precision_values_stay():
     previous, motion, guide, previous_guide = _inputs(18, 2, 5)
     image, confidence = reproject(jnp.asarray(previous, jnp.float16), motion, guide, previous_guide)

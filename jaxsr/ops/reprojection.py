@@ -26,7 +26,6 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxsr.errors import JaxsrError
-from jaxsr.ops._batch import over_batch
 
 DEFAULT_SIGMA_GUIDE = 0.15
 """Standard deviation of guide differences: base colour, unit normals (experiments/tune_classical.py)."""
@@ -93,13 +92,21 @@ def reproject(
     scale = jnp.broadcast_to(_inverse_sigma(sigma_guide), guide.shape[-1:])
     scale_space = _inverse_sigma(sigma_space)
 
+    # Always true, which the compiler cannot know: behind a condition it computes things once, where it would
+    # otherwise copy them into each of their readers. Taken here, so that it has no batch axis.
+    true = ~(jnp.minimum(motion_px[(0,) * motion_px.ndim], 1) > 2)
+
     def one(value: Array, motion: Array, g: Array, g_prev: Array) -> tuple[Array, Array]:
         there = _padded(g_prev, scale, pad=2 * int(np.abs(offsets).max()) + 1)
-        near = _Neighbourhood(motion, g, there, scale, scale_space)
+        near = _Neighbourhood(motion, g, there, scale, scale_space, true)
         kept = _select(jax.lax.stop_gradient(near), offsets, min(count, len(offsets)))
         return _filter(value, near, kept, offsets, min(count, len(offsets)))
 
-    return over_batch(one, previous, motion_px, guide, previous_guide)
+    # One image after the other: under vmap the gathers' indices are stored, and it takes twice as long.
+    def images(*arrays: Array) -> tuple[Array, Array]:
+        return one(*arrays) if arrays[0].ndim == 3 else jax.lax.map(lambda xs: images(*xs), arrays)
+
+    return images(previous, motion_px, guide, previous_guide)
 
 
 def candidate_offsets(strides: Sequence[int], radius: int) -> Int[np.ndarray, "n 2"]:
@@ -149,6 +156,7 @@ class _Neighbourhood(NamedTuple):
     """The previous guide, scaled and padded."""
     scale: Float[Array, " g"]
     scale_space: Float[Array, ""]
+    true: Bool[Array, ""]
 
 
 def _padded(guide: Float[Array, "h w g"], scale: Float[Array, " g"], pad: int) -> Float[Array, "hp wp g"]:
@@ -253,12 +261,11 @@ def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -
             functools.reduce(jnp.bitwise_or, tags[i : i + 32 // bits]) for i in range(0, count, 32 // bits)
         ]
 
-    # A loop that runs once, which the compiler cannot know: without it, it would copy all of the above into
-    # each place that reads a winner.
+    # A loop that runs once; unlike lax.cond it stays one when a caller maps over a batch.
     blank = [jnp.zeros(shape, jnp.uint32) for _ in range(0, count, 32 // bits)]
-    return jax.lax.while_loop(
-        lambda s: s[0], lambda s: (jnp.zeros_like(s[0]), words()), (_opaque_true(near), blank)
-    )[1]
+    return jax.lax.while_loop(lambda s: s[0], lambda s: (jnp.zeros_like(s[0]), words()), (near.true, blank))[
+        1
+    ]
 
 
 def _unpack(
@@ -290,8 +297,7 @@ def _filter(
         pixel = jax.tree.map(lambda a: a[..., None], _pixel(near))
         return jnp.where(pixel.usable, _distance(near, pixel, *_unpack(words, offsets, count)), _NOWHERE)
 
-    # Again only to have them computed once.
-    distance = jax.lax.cond(_opaque_true(near), distances, lambda: jnp.zeros((h, w, count)))
+    distance = jax.lax.cond(near.true, distances, lambda: jnp.zeros((h, w, count)))
     valid = distance[..., :1] < _NOWHERE
     # The first is the heaviest but for near-ties; the limit (not 0, where its gradient would be halved) only
     # acts on those of weights below exp(-10^6).
@@ -313,7 +319,3 @@ def _filter(
         total = total + weight[..., k, None]
     confidence = jnp.where(valid, jnp.exp(-distance[..., :1]), 0)
     return (image / total).astype(value.dtype), confidence
-
-
-def _opaque_true(near: _Neighbourhood) -> Bool[Array, ""]:
-    return _centre(near)[0][0, 0] < np.int32(2**31 - 1)
