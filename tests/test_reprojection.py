@@ -228,7 +228,7 @@ def test_jit_and_batch():
 
 
 def test_memory_stays_far_below_a_gather_of_all_candidates():
-    # Also guards the speed: when the compiler copies the selection into its readers, memory is the first sign.
+    # Also guards the speed: where the compiler copies the selection into its readers, memory shows it first.
     inputs = _inputs(20, 64, 96, g=6)
     compiled = jax.jit(reproject).lower(*inputs).compile()
     temporary = compiled.memory_analysis().temp_size_in_bytes / (64 * 96)
