@@ -1,5 +1,7 @@
 """jaxsr.io.exr: what is written comes back, and every way a file can be wrong is one clear line."""
 
+import contextlib
+import sys
 import threading
 
 import numpy as np
@@ -7,7 +9,7 @@ import OpenEXR
 import pytest
 
 from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import read_exr, read_exr_header, remove_leftovers, write_exr
+from jaxsr.io.exr import atomic_path, read_exr, read_exr_header, remove_leftovers, write_exr
 
 
 def example(h=20, w=30):
@@ -137,13 +139,42 @@ def _chunks_length(data: bytes) -> int:
     raise AssertionError("no chunk table")
 
 
-def test_damaged_pixels(tmp_path):
-    write_exr(tmp_path / "a.exr", {"Z": np.arange(6000, dtype=np.float32).reshape(60, 100)})
-    whole = bytearray((tmp_path / "a.exr").read_bytes())
+def damaged(path):
+    write_exr(path, {"Z": np.arange(6000, dtype=np.float32).reshape(60, 100)})
+    whole = bytearray(path.read_bytes())
     whole[len(whole) // 2 : len(whole) // 2 + 200] = b"\x55" * 200
-    (tmp_path / "a.exr").write_bytes(whole)
+    path.write_bytes(whole)
+    return path
+
+
+def test_damaged_pixels_are_one_error_and_nothing_is_printed(tmp_path, capsys):
+    path, stdout = damaged(tmp_path / "a.exr"), sys.stdout
     with pytest.raises(JaxsrError, match=r"a\.exr: the pixel data is damaged"):
-        read_exr(tmp_path / "a.exr")
+        read_exr(path)
+    assert capsys.readouterr().out == ""
+    assert sys.stdout is stdout
+
+
+def test_other_threads_print_while_damaged_pixels_are_read(tmp_path, capsys):
+    path, done, stdout = damaged(tmp_path / "a.exr"), threading.Event(), sys.stdout
+
+    def work():
+        for _ in range(30):
+            with contextlib.suppress(JaxsrError):
+                read_exr(path)
+        done.set()
+
+    threads = [threading.Thread(target=work) for _ in range(2)]
+    for t in threads:
+        t.start()
+    lines = 0
+    while lines < 50 or not done.is_set():
+        print("mine")
+        lines += 1
+    for t in threads:
+        t.join()
+    assert capsys.readouterr().out == "mine\n" * lines
+    assert sys.stdout is stdout
 
 
 def test_what_is_no_exr(tmp_path):
@@ -191,8 +222,13 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
 def test_leftovers_of_killed_writers_go(tmp_path):
     (tmp_path / ".0001.exr.77-1.tmp").write_bytes(b"half")
     (tmp_path / "0001.exr").write_bytes(b"x")
+    (tmp_path / ".notes.tmp").write_bytes(b"the user's own")
     assert remove_leftovers(tmp_path) == 1
-    assert [p.name for p in tmp_path.iterdir()] == ["0001.exr"]
+    assert sorted(p.name for p in tmp_path.iterdir()) == [".notes.tmp", "0001.exr"]
+    with atomic_path(tmp_path / "a.exr") as temporary:
+        temporary.write_bytes(b"whole")
+    temporary.write_bytes(b"as if killed")
+    assert remove_leftovers(tmp_path) == 1
 
 
 def test_reading_from_threads(tmp_path):

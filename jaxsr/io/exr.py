@@ -9,7 +9,9 @@ read. Writing is single-part, scan lines, lossless, and atomic.
 import contextlib
 import mmap
 import os
+import re
 import struct
+import sys
 import threading
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -33,6 +35,7 @@ _STRUCTURE = {
 }  # fmt: skip
 _LINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
 _MAGIC = 20000630
+_TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp")
 
 
 @contextlib.contextmanager
@@ -52,8 +55,8 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def remove_leftovers(folder: Path) -> int:
-    """Delete what killed writers left in `folder` (files named `.*.tmp`); returns how many."""
-    leftovers = list(Path(folder).glob(".*.tmp"))
+    """Delete what killed writers left in `folder` (names that `atomic_path` gives); returns how many."""
+    leftovers = [p for p in Path(folder).glob(".*.tmp") if _TEMPORARY.fullmatch(p.name)]
     for path in leftovers:
         path.unlink(missing_ok=True)
     return len(leftovers)
@@ -167,9 +170,45 @@ def write_exr(
             raise JaxsrError("cannot be written as OpenEXR", where=path, found=e) from e
 
 
+class _Muted:
+    """Python's stdout without what the reading threads print; all other threads write through it."""
+
+    lock = threading.Lock()
+    readers: set[int] = set()  # noqa: RUF012
+
+    def __init__(self, stream: Any):
+        self.stream = stream
+
+    def write(self, text: str) -> int:
+        return len(text) if threading.get_ident() in self.readers else self.stream.write(text)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.stream, name)
+
+
+@contextlib.contextmanager
+def _muted() -> Iterator[None]:
+    """The binding prints a warning about damaged pixels to stdout, where a program may expect JSON.
+
+    The lines that the C library writes to stderr stay: other threads may be writing there, too.
+    """
+    with _Muted.lock:
+        _Muted.readers.add(threading.get_ident())
+        if sys.stdout is not None and not isinstance(sys.stdout, _Muted):
+            sys.stdout = _Muted(sys.stdout)  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        with _Muted.lock:
+            _Muted.readers.discard(threading.get_ident())
+            if not _Muted.readers and isinstance(sys.stdout, _Muted):
+                sys.stdout = sys.stdout.stream
+
+
 def _open(path: Path, header_only: bool) -> Any:
     try:
-        file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
+        with _muted():
+            file = OpenEXR.File(str(path), separate_channels=True, header_only=header_only)
     except (RuntimeError, ValueError, TypeError) as e:
         raise JaxsrError("OpenEXR cannot read it", where=path, found=e, fix="write the file again") from e
     # A part whose pixels cannot be decoded is left out by the library, with a warning on stderr.
