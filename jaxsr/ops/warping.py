@@ -16,6 +16,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxsr.errors import JaxsrError
@@ -137,12 +138,11 @@ def occlusion_motion(
     return over_batch(occlude, motion_px, depth_linear)
 
 
-def _check_sizes(where: str, *arrays: Array) -> None:
+def _check_sizes(where: str, *arrays: ArrayLike) -> None:
     """All arrays must agree but for the channels: jaxtyping says so only when it is switched on."""
-    if len({a.shape[:-1] for a in arrays}) != 1:
-        raise JaxsrError(
-            "image sizes differ", where=where, expected="equal [.., H, W]", found=[a.shape for a in arrays]
-        )
+    shapes = [jnp.shape(a) for a in arrays]
+    if len({shape[:-1] for shape in shapes}) != 1:
+        raise JaxsrError("image sizes differ", where=where, expected="equal [.., H, W]", found=shapes)
 
 
 def _whole_and_fraction(
@@ -191,7 +191,9 @@ def _warp(image: Array, motion: Array, *, mode: Mode, boundary: Boundary) -> Arr
 
     if mode == "nearest":
         return tap(0, 0)
-    dtype = jnp.promote_types(image.dtype, fx.dtype)  # half-precision images are summed in the motion's
+    # A half-precision image is summed in the precision of the motion.
+    dtype = max(image.dtype, fx.dtype, key=lambda d: d.itemsize)
+    fx, fy = fx.astype(dtype), fy.astype(dtype)
     rows = []
     for ky, wy in _kernel(mode, fy).items():
         row = [wx[..., None] * tap(ky, kx).astype(dtype) for kx, wx in _kernel(mode, fx).items()]
