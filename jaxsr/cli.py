@@ -5,6 +5,7 @@ that `jaxsr --help` answers at once.
 """
 
 import json as json_module
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -93,7 +94,8 @@ def inspect(
 ) -> None:
     """Look through a sequence: buffers, motion convention, jitter, and what each method lacks.
 
-    Exits with 1 if something is wrong with the sequence, 0 otherwise.
+    Exits with 0 if methods can use it, 1 if something in it is wrong (all of that is listed), 2 if it cannot
+    be read as a sequence.
 
     Args:
         sequence: folder of the sequence.
@@ -178,6 +180,7 @@ def upscale(
             scale=scale or max(opened.scales, default=1),
             every=every,
             advance=progress("frames", len(opened)),
+            keep=False,
         )
     print(
         f"{len(opened)} frames in {out}: {timing.median_ms:.1f} ms a frame, "
@@ -237,8 +240,9 @@ def render(
 
         def show(at: RenderProgress) -> None:
             speed = bar.tasks[0].speed
-            rate = f"{60 * speed:.1f} frames/min" if speed else ""
-            bar.update(task, total=at.total_frames, completed=at.done_frames, message=at.message, rate=rate)
+            rate = f"  {60 * speed:.1f} frames/min" if speed else ""
+            count = f"{at.done_frames:.1f}/{at.total_frames}{rate}"
+            bar.update(task, total=at.total_frames, completed=at.done_frames, message=at.message, count=count)
 
         render_scene(
             scene,
@@ -281,3 +285,9 @@ def main(arguments: list[str] | None = None) -> None:
     except KeyboardInterrupt:
         print("jaxsr: interrupted", file=sys.stderr)
         raise SystemExit(130) from None
+    except BrokenPipeError:  # `jaxsr inspect SEQ | head`
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise SystemExit(0) from None
+    except OSError as error:  # no space, no permission: the system's words
+        print(f"jaxsr: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
+        raise SystemExit(2) from None

@@ -34,7 +34,7 @@ def demo(tmp_path_factory):
 def test_the_demo_writes_frames_videos_metrics_and_a_page(demo):
     out, sections, steps = demo
     assert len(sections) == 4
-    assert steps.count("frames") == 2 * 4 * (5 + 5)
+    assert steps.count("frames") == 2 * 2 * 4 * (5 + 5)
     for name in ("one-test-0", "two-test-0"):
         for task in ("super-resolution", "extrapolation"):
             assert (out / f"{name}-{task}.mp4").stat().st_size > 1000
@@ -117,3 +117,23 @@ def test_a_method_says_which_buffer_it_lacks(tmp_path):
     assert not (tmp_path / "out").exists()
     with pytest.raises(JaxsrError, match=r"unknown method 'magic'.*one of nearest"):
         find_method("magic")
+
+
+def test_frames_of_two_sequences_do_not_mix(tmp_path):
+    long = make_sequence(tmp_path / "long", frames=4)
+    short = make_sequence(tmp_path / "short", frames=2)
+    upscale(long, find_method("nearest"), tmp_path / "out", scale=2, keep=False)
+    with pytest.raises(JaxsrError, match=r"holds 0003.exr, which is not a frame of this sequence"):
+        upscale(short, find_method("nearest"), tmp_path / "out", scale=2)
+
+
+def test_a_moving_camera_without_motion_is_an_error(tmp_path):
+    def freeze(resolution, index, layers):
+        layers["motion"] = np.zeros_like(layers["motion"])
+
+    sequence = make_sequence(tmp_path / "seq", frames=2, spoil=freeze)
+    with pytest.raises(JaxsrError, match="motion is zero everywhere, yet the camera moves"):
+        upscale(sequence, find_method("taau"), tmp_path / "out", scale=2)
+    upscale(sequence, find_method("bilinear"), tmp_path / "a", scale=2)  # does without motion
+    still = make_sequence(tmp_path / "still", frames=2, still=True, frozen=True)
+    upscale(still, find_method("taau"), tmp_path / "b", scale=2)  # nothing moves: zero is right

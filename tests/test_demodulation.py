@@ -84,3 +84,13 @@ def test_bad_guard_is_named():
     color, base, *_ = _scene(4, (1, 1))
     with pytest.raises(JaxsrError, match="positive"):
         ops.demodulate(color, base, eps=0.0)
+
+
+def test_the_divisor_does_not_jump_between_dark_surfaces():
+    """Lighting that a filter carries from a dark surface to a darker one must not flare up."""
+    base = jnp.repeat(jnp.linspace(0.001, 0.05, 200)[:, None, None], 3, -1)
+    divisor = np.asarray(ops.demodulation_divisor(base))[:, 0, 0]
+    assert (divisor[1:] / divisor[:-1]).max() < 1.1
+    assert divisor[0] == pytest.approx(0.02)
+    tint = jnp.array([[[0.0, 0.019, 0.0]]])  # one dark channel is a surface too
+    np.testing.assert_allclose(ops.demodulation_divisor(tint), 0.02)

@@ -65,13 +65,13 @@ def test_streaming_equals_scan(name):
     np.testing.assert_allclose(np.stack(outputs(name, 2, 4, 2)), images, rtol=2e-4, atol=2e-4)
 
 
-@pytest.mark.parametrize("name", ["bilinear", "taau"])
+@pytest.mark.parametrize("name", ["bilinear", "taau", "guided", "guided-taau"])
 def test_jit_equals_eager(name):
     frames, _ = clip(2, 4, 2)
-    method = METHODS[name]
+    method, compiled = METHODS[name], outputs(name, 2, 4, 2)
     with jax.disable_jit():
-        state = method.init(frames[0])
-        for frame, expected in zip(frames[:2], outputs(name, 2, 4, 2), strict=False):
+        state = method.init(jax.tree.map(jnp.asarray, frames[0]))
+        for frame, expected in zip(frames[:2], compiled, strict=False):
             state, image = method.step(None, state, jax.tree.map(jnp.asarray, frame))
             np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-4)
 
@@ -181,3 +181,70 @@ def test_stream_names_what_is_wrong():
     other, _ = analytic.frame(1, (48, 54), 2, (0.0, 0.0))
     with pytest.raises(JaxsrError, match=r"frame 1: .*change within the sequence"):
         list(stream(METHODS["taau"], [frames[0], other]))
+
+
+def test_guided_taau_is_worth_its_buffers():
+    for every in (1, 2):
+        _, truths = clip(2, 8, every)
+        pairs = zip(outputs("guided-taau", 2, 8, every), outputs("guided", 2, 8, every), truths, strict=True)
+        assert np.mean([psnr(a, t) - psnr(b, t) for a, b, t in pairs]) > 1.0
+
+
+@pytest.mark.parametrize("name", ["guided", "guided-taau"])
+def test_dark_surfaces_have_no_specks(name):
+    """Base colours around the guard of the demodulation: light must keep its scale from one to the next."""
+    frames, truths = clip(2, 6, 2)
+    k = np.float32(0.03)
+    dark = [
+        f._replace(
+            color_linear=f.color_linear * k,
+            lr=f.lr._replace(base_color=f.lr.base_color * k),
+            hr=f.hr._replace(base_color=f.hr.base_color * k),
+        )
+        for f in frames
+    ]
+    brightest = max(t.max() for t in truths) * k
+    for made in stream(METHODS[name], dark):
+        assert made.image.max() < 2 * brightest
+
+
+def test_taau_forgets_light_that_went_out():
+    """The clipping box: a history that the frame contradicts is dropped at once, not averaged away."""
+    frames, truths = clip(2, 8, still=True)
+    frames = [
+        f if t < 6 else f._replace(color_linear=f.color_linear * np.float32(0.2))
+        for t, f in enumerate(frames)
+    ]
+    made = [m.image for m in stream(METHODS["taau"], frames)]
+    assert np.abs(made[6] - 0.2 * truths[0]).mean() < 0.1
+
+
+@pytest.mark.parametrize("name", ["taau", "guided", "guided-taau"])
+def test_a_broken_pixel_does_not_spread(name):
+    frames, _ = clip(2, 6, still=True)
+    color = frames[2].color_linear.copy()
+    color[10, 20] = np.nan
+    frames = [*frames[:2], frames[2]._replace(color_linear=color), *frames[3:]]
+    broken = [int(np.isnan(m.image).any(-1).sum()) for m in stream(METHODS[name], frames)]
+    assert broken[:2] == [0, 0]
+    assert 0 < broken[2] <= 64  # seen once: nobody should miss it
+    assert broken[3:] == [0, 0, 0]
+
+
+@pytest.mark.parametrize("change", ["depth", "motion", "infinite motion"])
+def test_history_counts_for_nothing_in_disocclusions(change):
+    frames, _ = clip(2, 2)
+    frame = jax.tree.map(jnp.asarray, frames[1])
+    h, w = frame.hr.depth_linear.shape[:2]
+    depth = jnp.full((h, w, 1), 5.0)
+    motion = jnp.full((h, w, 2), {"depth": 0.25, "motion": 300.0, "infinite motion": jnp.inf}[change])
+    here = frame._replace(hr=frame.hr._replace(depth_linear=depth, motion_px=motion))
+    image, before = jnp.ones((h, w, 3)), depth * (2 if change == "depth" else 1)
+    _, weight = taau.fetch_history(image, jnp.ones((h, w, 1)), before, here, taau.Options())
+    np.testing.assert_allclose(weight, 0.0, atol=1e-6)
+
+
+def test_the_slope_of_one_row_is_that_of_its_columns():
+    inverse = jnp.array([1.0, 0.9, 0.8, 0.7])[None, :, None]
+    np.testing.assert_allclose(taau.slope(inverse), 0.1, rtol=1e-5)
+    np.testing.assert_allclose(taau.slope(jnp.ones((1, 1, 1))), 0.0)

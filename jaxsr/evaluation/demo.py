@@ -51,15 +51,21 @@ def run_demo(
     opened = [FrameSequence.open(path) for path in sequences]
     tasks = (("super-resolution", 1, UPSCALERS), ("extrapolation", 2, EXTRAPOLATORS))
     total = sum(len(s) * len(methods) for s in opened for _, _, methods in tasks)
-    advance = progress("frames", total)
-    sections = []
+    advance = progress("frames", 2 * total)  # made, and measured
+    sections, compiled = [], dict[Any, float]()
     for sequence in opened:
         for task, every, methods in tasks:
             folder = out / sequence.name / task
-            sections.append(run_section(sequence, methods, folder, scale=scale, every=every, advance=advance))
+            sections.append(
+                run_section(
+                    sequence, methods, folder, scale=scale, every=every, advance=advance, compiled=compiled
+                )
+            )
     meta = description(scale=scale)
+    advance = progress("page", 1)
     write_report(out / "report.html", sections, title="jaxsr demo", meta=meta)
     write_metrics(out, sections, title="jaxsr demo", meta=meta)
+    advance()
     advance = progress("videos", len(sections))
     names = [
         (s, task, rival)

@@ -1,7 +1,7 @@
 """A method over a sequence, frame by frame in constant memory, with the compilation timed apart.
 
 `stream` feeds any iterable of frames to a method's step. What a frame holds is decided here: `observed` reads
-a sequence so that the truth, and the colour of frames that are to be extrapolated, are never even loaded.
+a sequence so that the truth, and the colour of frames that are to be extrapolated, are never handed over.
 """
 
 import time
@@ -81,6 +81,16 @@ def check_needs(method: Method, sequence: Sequence, scale: int) -> None:
             found=", ".join(sorted(have)),
             fix="export these buffers, or choose a method that does without (jaxsr inspect lists them)",
         )
+    if "hr.motion" in method.needs and len(sequence) > 1 and not sequence.infos[1].cut:
+        before, after = (np.asarray(info.world_from_view) for info in sequence.infos[:2])
+        motion = np.asarray(sequence.frame(1, scale, rendered=False).hr.motion_px)
+        if not motion.any() and not np.allclose(before, after, atol=1e-6):
+            raise JaxsrError(
+                "motion is zero everywhere, yet the camera moves",
+                where=f"{sequence.path}, frame {sequence.infos[1].index}",
+                expected="backward motion in pixels",
+                fix="export motion vectors (see jaxsr inspect), or choose a method that does without",
+            )
 
 
 def _layer(field: str) -> str:

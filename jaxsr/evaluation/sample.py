@@ -35,7 +35,7 @@ def unpack_sample(
     out: Path,
     split: str,
     scenes: tuple[str, ...] = (),
-    scale: int = 1,
+    scale: int | None = None,
     progress: Callable[[str, int], Callable[[], Any]] = lambda title, total: lambda: None,
 ) -> list[Path]:
     """Unpack the sequences of a split to `out/<name>`; what is there already is kept.
@@ -57,15 +57,15 @@ def unpack_sample(
     if unknown:
         raise JaxsrError(f"no scene {unknown[0]!r} in the sample", expected=", ".join(known))
     found = []
-    for scene in scenes or known:
+    for scene in dict.fromkeys(scenes or known):
         archive = sample_folder() / f"{scene}.jsrz"
         manifest = read_manifest(archive)
         found += [(archive, manifest, n) for n in manifest["sequences"] if f"-{split}-" in n]
     if not found:
         raise JaxsrError("no such part of the sample", where="split", expected="test or train", found=split)
     for archive, manifest, name in found:
-        scales = [1, *manifest["sequences"][name]["scales"]]
-        if scale not in scales:
+        scales = manifest["sequences"][name]["scales"]
+        if scale is not None and scale not in scales:
             raise JaxsrError(f"scale {scale} is not available", where=archive, expected=f"one of {scales}")
     advance = progress("unpack", len(found))
     folders = []

@@ -1,9 +1,10 @@
 """Methods over a sequence on disk: frames out as EXR and PNG, and a `Section` of results.
 
-The truth is read only after a method has made its frame, and only to measure it.
+No method is given the truth; it is read to measure what they made.
 """
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +36,7 @@ def upscale(
     scale: int,
     every: int = 1,
     advance: Advance | None = None,
+    keep: bool = True,
 ) -> tuple[list[np.ndarray], Timing]:
     """Run one method over a sequence and write `out/exr/0001.exr` (linear half) and `out/png/0001.png`.
 
@@ -42,14 +44,17 @@ def upscale(
         scale: of the LR frames to start from; 1 takes the HR frames, to make only those between them.
         every: every n-th frame counts as rendered, the others are extrapolated from their G-buffer.
         advance: progress callback.
+        keep: return the images; without them memory does not grow with the clip.
 
     Returns:
-        The display-referred images, and the time of a frame.
+        The display-referred images (none unless `keep`), and the time of a frame.
 
     Raises:
-        JaxsrError: what the method needs is not there, or a frame cannot be read.
+        JaxsrError: what the method needs is not there, a frame cannot be read (those before it stay), or the
+            folder holds frames of something else.
     """
     check_needs(method, sequence, scale)
+    _check_folder(out, {info.index for info in sequence.infos})
     images, seconds, compile_seconds = [], [], 0.0
     for info, made in zip(sequence.infos, stream(method, observed(sequence, scale, every)), strict=True):
         half = np.clip(made.image, 0, np.finfo(np.float16).max).astype(np.float16)
@@ -57,13 +62,26 @@ def upscale(
         write_exr(out / "exr" / f"{info.index:04d}.exr", channels)
         image = display(made.image, sequence.exposure)
         write_png(out / "png" / f"{info.index:04d}.png", image)
-        images.append(image)
+        if keep:
+            images.append(image)
         seconds.append(made.seconds)
         compile_seconds += made.compile_seconds
         if advance is not None:
             advance()
     low, middle, high = np.percentile(seconds, [25, 50, 75]) * 1e3
     return images, Timing(compile_seconds, float(middle), float(high - low))
+
+
+def _check_folder(out: Path, frames: set[int]) -> None:
+    """See that frames of another sequence do not mix with those to come."""
+    for kind in ("exr", "png"):
+        for file in sorted((out / kind).glob(f"*.{kind}")):
+            if not file.stem.isdigit() or int(file.stem) not in frames:
+                raise JaxsrError(
+                    f"holds {file.name}, which is not a frame of this sequence",
+                    where=out / kind,
+                    fix="choose another folder with --out, or remove it",
+                )
 
 
 def run_section(
@@ -74,10 +92,15 @@ def run_section(
     scale: int,
     every: int = 1,
     advance: Advance | None = None,
+    compiled: dict[Any, float] | None = None,
 ) -> Section:
     """Several methods over one sequence, each measured against the truth.
 
     Writes `out/<method>/exr|png/` and `out/truth/png/`.
+
+    Args:
+        advance: called twice a frame and method: when it is made, and when it is measured.
+        compiled: seconds that compiling took in earlier sections, where it was not needed again; added to.
 
     Raises:
         JaxsrError: an unknown method, a missing buffer, or a sequence without truth.
@@ -104,9 +127,16 @@ def run_section(
                 expected=truths[0].shape,
                 found=images[0].shape,
             )
+        if compiled is not None:
+            key = (method.name, scale, sequence.size)
+            compiled[key] = max(timing.compile_s, compiled.get(key, 0.0))
+            timing = replace(timing, compile_s=compiled[key])
         tracks.append(
             measured(method.name, images, truths, starts=starts, timing=timing, note=method.summary)
         )
+        for _ in images:
+            if advance is not None:
+                advance()
     task = f"x{scale}" if scale > 1 else "full size"
     if every == 2:
         task += ", every second frame extrapolated"

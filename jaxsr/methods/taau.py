@@ -2,17 +2,18 @@
 
 Jittered LR frames are accumulated into an HR history. Symbols:
 
-    p       HR pixel,  x = (p + 0.5) / s - 0.5 - J  its place in the jittered LR frame (I_N(p) = I_J(p - J))
-    q       the 3 x 3 LR pixels around x,  d = s (q - x)  their distance to p in HR pixels
-    h       history at p - MV_N(p), Catmull-Rom                       (equation 2 of the jitter text)
+    p       HR pixel,  x = (p + 0.5) / s - 0.5 - J  its place in the jittered LR frame   (equation 1)
+    q       the 3 x 3 LR pixels around x,  d = q - x  their distance in LR pixels
+    h       history at p - MV_N(p), Catmull-Rom                                         (equation 2)
     n       what h is worth: the sum of the weights it has collected, at most `memory`
 
-    c       = sum_q k(d) I(q) / sum_q k(d),   k Gaussian of `kernel_sigma` LR pixels
-    beta    = max_q exp(-|d|^2 / (2 sample_sigma^2)): near 1 where a sample falls on p
+    c       = sum_q k(d) I(q) / sum_q k(d),   k Gaussian of `kernel_sigma`
+    beta    = max(max_q exp(-|s d|^2 / (2 sample_sigma^2)), floor): 1 where a sample falls on p
     h'      = h clipped to the box of the 3 x 3 samples in YCoCg
-    n'      = n where depth agrees with the previous frame and p was in view, else 0
+    n'      = n times the bilinear share of the taps at p - MV_N(p) whose depth agrees: 0 in disocclusions
     out     = (n' h' + beta c) / (n' + beta),   n <- min(n' + beta, memory)
 
+Equations are those of `jaxsr.ops.jitter`; motion says where to look, depth whether to trust what is there.
 The average is taken of tone-mapped colour (Reinhard), so that one bright sample does not flicker. A frame
 that was not rendered is the history warped backward, unclipped: the plain warp that guided reprojection must
 beat.
@@ -154,9 +155,13 @@ def accumulate(
 ) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 1"]]:
     """Blend the estimate of one frame into the history, which is worth `weight` (n'), in working space.
 
+    A history that is NaN (a broken pixel came in) counts for nothing, so that it does not spread.
+
     Returns:
         The new history and its weight.
     """
+    lost = jnp.any(jnp.isnan(history), -1, keepdims=True) | jnp.isnan(weight)
+    history, weight = jnp.where(lost, now.color, history), jnp.where(lost, 0, weight)
     middle, half = 0.5 * (now.low + now.high), 0.5 * options.box * (now.high - now.low)
     clipped = jnp.clip(history, middle - half, middle + half)
     beta = jnp.maximum(now.confidence, options.floor)
@@ -229,10 +234,11 @@ def slope(inverse_depth: Float[Array, "H W 1"]) -> Float[Array, "H W 1"]:
         ends = [(0, 0)] * 3
         before, after = list(ends), list(ends)
         before[axis], after[axis] = (1, 0), (0, 1)
-        change = change + jnp.minimum(
+        least = jnp.minimum(
             jnp.pad(step, before, constant_values=jnp.inf), jnp.pad(step, after, constant_values=jnp.inf)
         )
-    return jnp.where(jnp.isfinite(change), change, 0)
+        change = change + jnp.where(jnp.isfinite(least), least, 0)  # an axis of one pixel has no neighbours
+    return change
 
 
 def _all_alike(features: Float[Array, "H W g"]) -> Float[Array, "H W 1"]:

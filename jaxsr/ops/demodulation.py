@@ -3,10 +3,11 @@
 The divisor is the base colour (ExtraSS, notes section on G-buffer-guided reprojection), or with `specular`
 that of ExtraNet for glossy scenes, `base + 0.08 specular (1 - metallic)`. All is scene-linear.
 
-Guard: where no channel of the divisor reaches `eps` (sky, emitters, missing or NaN base colour) the divisor
-is 1, hence lighting is colour; elsewhere each channel is at least `eps`. The guard bounds lighting by
+Guard: where no channel of the divisor is positive (sky, emitters, missing or NaN base colour) the divisor is
+1, hence lighting is colour; elsewhere each channel is at least `eps`. The guard bounds lighting by
 `color / eps` and the gradient with respect to the base colour by `color / eps^2`; without it a dark texel
-makes one bright speck of lighting that a filter would spread. `modulate` inverts `demodulate` for any guard.
+makes one bright speck of lighting that a filter would spread. Among surfaces the divisor is continuous:
+lighting that crosses from a dark to a darker one keeps its scale. `modulate` inverts `demodulate`.
 """
 
 import functools
@@ -42,9 +43,8 @@ def demodulation_divisor(
     if specular is not None:
         dielectric = 1.0 if metallic is None else 1.0 - metallic
         divisor = divisor + 0.08 * specular * dielectric
-    colored = divisor >= eps  # False for NaN
-    guarded = jnp.where(colored, divisor, eps)
-    return jnp.where(jnp.any(colored, axis=-1, keepdims=True), guarded, 1.0)
+    guarded = jnp.where(divisor >= eps, divisor, eps)  # eps for NaN
+    return jnp.where(jnp.any(divisor > 0, axis=-1, keepdims=True), guarded, 1.0)
 
 
 @functools.partial(jax.jit, static_argnames=("eps",))

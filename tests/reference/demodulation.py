@@ -13,7 +13,7 @@ def divisor(
             if specular is not None:
                 metal = 0.0 if metallic is None else float(metallic[y, x, 0])
                 pixel = [v + 0.08 * float(specular[y, x, 0]) * (1 - metal) for v in pixel]
-            if all(v < eps for v in pixel):
+            if not any(v > 0 for v in pixel):
                 out[y, x] = 1.0
             else:
                 out[y, x] = [max(v, eps) for v in pixel]
