@@ -198,12 +198,35 @@ def test_a_file_lost_or_cut_after_opening(seq):
         (lambda h: h["frames"][2].update(jitter_px=[0, float("nan")]), "frame 3: camera or jitter"),
         (lambda h: h["frames"][1].update(index=7), "frame 7 follows frame 1"),
         (lambda h: h["frames"].reverse(), "frame 2 follows frame 3"),
+        (lambda h: h.update(fps="abc"), 'bad fps; expected a number above 0; found "abc"'),
+        (lambda h: h.update(fps=0), "bad fps.*found 0"),
+        (lambda h: h.update(fps=float("inf")), "bad fps.*found Infinity"),
+        (lambda h: h.update(exposure=None), "bad exposure; expected a number above 0; found null"),
+        (lambda h: h.update(exposure=0.0), "bad exposure.*found 0.0"),
+        (lambda h: h.update(exposure=-1), "bad exposure.*found -1"),
+        (lambda h: h.update(exposure=float("nan")), "bad exposure.*found NaN"),
+        (lambda h: h.update(exposure=True), "bad exposure.*found true"),
+        (lambda h: h.update(name=["a"]), r'bad name; expected a text; found \["a"\]'),
+        (lambda h: h.update(generator="x"), 'bad generator.*found "x"'),
+        (lambda h: h["frames"][1].update(index=float("inf")), "entry 1 of frames.*found index Infinity"),
+        (lambda h: h["frames"][1].update(index=1.5), "entry 1 of frames.*found index 1.5"),
+        (lambda h: h["frames"][1].update(index="2"), 'entry 1 of frames.*found index "2"'),
+        (lambda h: h["frames"][0].update(index=-1), "entry 0 of frames.*found index -1"),
+        (lambda h: h["frames"][1]["camera"].update(tan_half_fov=[0, 0]), "frame 2: bad tan_half_fov"),
+        (lambda h: h["frames"][1]["camera"].update(tan_half_fov=[0.5, -0.3]), "above 0; found .0.5, -0.3."),
+        (
+            lambda h: h["frames"][1]["camera"].update(lens_shift=[float("nan"), 0]),
+            "frame 2: camera or jitter",
+        ),
+        (lambda h: h["frames"][1]["camera"].update(world_from_view=[[0] * 4] * 4), "frame 2.*is singular"),
+        (lambda h: h["frames"][1]["camera"]["world_from_view"][0].__setitem__(3, float("inf")), "not finite"),
     ],
 )
 def test_bad_descriptions(seq, change, message):
     edit(seq, change)
-    with pytest.raises(JaxsrError, match=message):
+    with pytest.raises(JaxsrError, match=message) as caught:
         Sequence.open(seq.path)
+    assert "\n" not in str(caught.value)
 
 
 def test_what_is_no_sequence(tmp_path, seq):
@@ -294,6 +317,10 @@ def test_writer_refuses(tmp_path, hr, lr, message):
 def test_writer_arguments(tmp_path):
     with pytest.raises(JaxsrError, match="scale 5 does not divide"):
         writer(tmp_path, scales=(5,))
+    with pytest.raises(JaxsrError, match="bad fps; expected a number above 0; found 0"):
+        writer(tmp_path, fps=0)
+    with pytest.raises(JaxsrError, match=r"bad exposure.*found nan"):
+        writer(tmp_path, exposure=float("nan"))
     with pytest.raises(JaxsrError, match="bad precision of 'depth'"):
         writer(tmp_path, precision={"depth": "double"})
     with pytest.raises(JaxsrError, match="not JSON"):

@@ -195,7 +195,7 @@ def _muted() -> Iterator[None]:
     with _Muted.lock:
         _Muted.readers.add(threading.get_ident())
         if sys.stdout is not None and not isinstance(sys.stdout, _Muted):
-            sys.stdout = _Muted(sys.stdout)  # type: ignore[assignment]
+            sys.stdout = _Muted(sys.stdout)
     try:
         yield
     finally:

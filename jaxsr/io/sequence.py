@@ -7,6 +7,7 @@ and checked, frame by frame. Nothing but the description is kept in memory. Read
 
 import itertools
 import json
+import math
 import queue
 import threading
 from collections.abc import Iterable, Iterator
@@ -305,6 +306,18 @@ def _read_head(path: Path) -> dict[str, Any]:
     for s in scales:
         if size[0] % s or size[1] % s:
             raise JaxsrError(f"scale {s} does not divide the size", where=file, found=f"{size[0]}x{size[1]}")
+    for key in ("fps", "exposure"):
+        value = head.get(key, 1.0)
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if not (number and math.isfinite(value) and value > 0):
+            raise JaxsrError(f"bad {key}", where=file, expected="a number above 0", found=json.dumps(value))
+    for key, kind, words in (
+        ("name", str, "a text"),
+        ("license", str, "a text"),
+        ("generator", dict, "{...}"),
+    ):
+        if not isinstance(head.get(key, kind()), kind):
+            raise JaxsrError(f"bad {key}", where=file, expected=words, found=json.dumps(head[key]))
     if not isinstance(head.get("frames"), list) or not head["frames"]:
         raise JaxsrError("no frames", where=file, expected='"frames": a list of at least one frame')
     return head
@@ -312,25 +325,40 @@ def _read_head(path: Path) -> dict[str, Any]:
 
 def _frame_info(entry: Any, k: int, path: Path) -> FrameInfo:
     try:
-        camera = entry["camera"]
+        camera, index = entry["camera"], entry["index"]
+        if not isinstance(index, int) or isinstance(index, bool) or index < 0:
+            raise ValueError(f"index {json.dumps(index)}")
         info = FrameInfo(
-            index=int(entry["index"]),
+            index=index,
             jitter_px=tuple(np.asarray(entry["jitter_px"], float).reshape(2).tolist()),
             cut=bool(entry["cut"]),
             world_from_view=np.asarray(camera["world_from_view"], float).reshape(4, 4),
             tan_half_fov=tuple(np.asarray(camera["tan_half_fov"], float).reshape(2).tolist()),
             lens_shift=tuple(np.asarray(camera.get("lens_shift", [0, 0]), float).reshape(2).tolist()),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as e:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as e:
         raise JaxsrError(
             f"entry {k} of frames is not right",
             where=path / "sequence.json",
             expected="index, jitter_px, cut, camera (world_from_view, tan_half_fov, lens_shift)",
             found=f"missing {e}" if isinstance(e, KeyError) else e,
         ) from e
-    numbers = np.concatenate([np.ravel(x) for x in (info.jitter_px, info.world_from_view, info.tan_half_fov)])
-    if not np.isfinite(numbers).all():
-        raise JaxsrError(f"frame {info.index}: camera or jitter is not finite", where=path / "sequence.json")
+    matrix, where = info.world_from_view, path / "sequence.json"
+    numbers = [np.ravel(x) for x in (info.jitter_px, matrix, info.tan_half_fov, info.lens_shift)]
+    if not np.isfinite(np.concatenate(numbers)).all():
+        raise JaxsrError(f"frame {info.index}: camera or jitter is not finite", where=where)
+    if min(info.tan_half_fov) <= 0:
+        found = list(info.tan_half_fov)
+        raise JaxsrError(
+            f"frame {info.index}: bad tan_half_fov", where=where, expected="numbers above 0", found=found
+        )
+    if np.linalg.matrix_rank(matrix[:3, :3]) < 3:
+        raise JaxsrError(
+            f"frame {info.index}: world_from_view is singular",
+            where=where,
+            expected="a rotation and a translation",
+            found=matrix[:3, :3].tolist(),
+        )
     return info
 
 

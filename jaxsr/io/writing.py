@@ -6,6 +6,7 @@ runs in the Python of a renderer that has no JAX.
 """
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -135,6 +136,9 @@ class SequenceWriter:
         for layer, kind in [*self.precision.items(), *self.round_bits.items()]:
             if layer not in LAYERS or kind not in ("half", "float", "uint", *range(1, 24)):
                 raise JaxsrError(f"bad precision of {layer!r}", expected="half, float or uint", found=kind)
+        for key, value in (("fps", fps), ("exposure", exposure)):
+            if not (math.isfinite(value) and value > 0):
+                raise JaxsrError(f"bad {key}", where=self.path, expected="a number above 0", found=value)
         for s in self.scales:
             if s < 1 or self.size[0] % s or self.size[1] % s:
                 raise JaxsrError(
