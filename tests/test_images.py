@@ -1,12 +1,15 @@
 """jaxsr.io.images: PNG round trips, the sRGB curve, and which layer of an OpenEXR file is the colour."""
 
+import struct
+import zlib
+
 import numpy as np
 import pytest
 from PIL import Image
 
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import write_exr
-from jaxsr.io.images import read_color, read_png, srgb_to_linear, write_png
+from jaxsr.io.images import linear_to_srgb, read_color, read_png, srgb_to_linear, write_png
 
 
 def test_png_round_trip(tmp_path):
@@ -50,6 +53,9 @@ def test_srgb_curve():
     # IEC 61966-2-1: the two branches meet at 0.04045; 0.5 decodes to 0.21404.
     x = np.array([0.0, 0.04045, 0.5, 1.0], np.float32)
     np.testing.assert_allclose(srgb_to_linear(x), [0, 0.0031308, 0.2140411, 1], atol=1e-6)
+    np.testing.assert_allclose(linear_to_srgb(srgb_to_linear(x)), x, atol=1e-6)
+    np.testing.assert_allclose(linear_to_srgb(np.array([-1.0, 2.0])), [0, 1], atol=1e-12)
+    assert srgb_to_linear(x).dtype == linear_to_srgb(x).dtype == np.float32
 
 
 def test_read_color(tmp_path):
@@ -87,6 +93,15 @@ def test_read_color_errors(tmp_path):
         read_color(tmp_path / "a.png")
     with pytest.raises(JaxsrError, match="no such file"):
         read_color(tmp_path / "gone.png")
+    write_png(tmp_path / "huge.png", np.zeros((2, 2, 3)))
+    data = bytearray((tmp_path / "huge.png").read_bytes())
+    data[16:24] = struct.pack(">II", 60000, 60000)
+    data[29:33] = struct.pack(">I", zlib.crc32(data[12:29]))
+    (tmp_path / "huge.png").write_bytes(data)
+    with pytest.raises(
+        JaxsrError, match=r"huge\.png: cannot be read as a picture; found .*3600000000 pixels"
+    ):
+        read_color(tmp_path / "huge.png")
     write_png(tmp_path / "whole.png", np.random.default_rng(0).random((64, 64, 3)))
     (tmp_path / "cut.png").write_bytes((tmp_path / "whole.png").read_bytes()[:3000])
     with pytest.raises(JaxsrError, match=r"cut\.png: cannot be read"):

@@ -182,6 +182,50 @@ def test_archives_are_deterministic_and_checked(packed, tmp_path):
         archive.read_manifest(file)
 
 
+def write_manifest(file: Path, manifest: object) -> Path:
+    with zipfile.ZipFile(file, "w") as out:
+        out.writestr("manifest.json", json.dumps(manifest))
+    return file
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["../../evil", "/evil", "train/../../evil", "C:\\evil", "\\\\host\\evil", "..\\evil", "C:evil", ""],
+)
+def test_names_that_lead_out_of_the_folder_are_refused(tmp_path, name):
+    head = {"format": archive.FORMAT, "version": archive.VERSION, "members": {}}
+    file = write_manifest(tmp_path / "a.jsrz", head | {"sequences": {name: {}}})
+    with pytest.raises(JaxsrError, match="unsafe name of a sequence"):
+        archive.read_manifest(file)
+    assert md.main(["unpack", str(tmp_path / "out"), "--archive", str(file)]) == 2
+    assert [p.name for p in tmp_path.iterdir()] == ["a.jsrz"]
+
+
+def test_damaged_manifests_and_checksums(tmp_path):
+    head = {"format": archive.FORMAT, "version": archive.VERSION, "members": {}}
+    for manifest, words in [
+        ([], "not an archive.*expected a manifest; found list"),
+        ({"format": "x"}, "another kind of archive"),
+        (head, 'damaged manifest; expected "sequences"'),
+        (head | {"sequences": []}, 'damaged manifest; expected "sequences"'),
+    ]:
+        with pytest.raises(JaxsrError, match=words):
+            archive.read_manifest(write_manifest(tmp_path / "a.jsrz", manifest))
+    (tmp_path / "a.jsrz.sha256").write_text("")
+    with pytest.raises(JaxsrError, match="checksum does not match"):
+        archive.verify(tmp_path / "a.jsrz")
+
+
+def test_packing_removes_what_a_killed_one_left(tmp_path):
+    source = write_sequence(tmp_path / "source", frames=1)
+    (tmp_path / "shelf").mkdir()
+    (tmp_path / "shelf" / ".docks.jsrz.77-1.tmp").write_bytes(b"half")
+    (tmp_path / "shelf" / ".mine.tmp").write_bytes(b"not ours")
+    archive.pack({"s": source}, tmp_path / "shelf" / "a.jsrz")
+    found = sorted(p.name for p in (tmp_path / "shelf").iterdir())
+    assert found == [".mine.tmp", "a.jsrz", "a.jsrz.sha256"]
+
+
 def test_archive_of_limited_size(tmp_path):
     source = write_sequence(tmp_path / "source")
     with pytest.raises(JaxsrError, match=r"grows too large.*at most 0\.001 MB.*--color-bits"):

@@ -11,14 +11,14 @@ import hashlib
 import json
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.io.archive_coding import decode_frame, encode_frame
-from jaxsr.io.exr import atomic_path, read_exr
+from jaxsr.io.exr import atomic_path, read_exr, remove_leftovers
 from jaxsr.io.sequence import Sequence
 from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter, frame_file
 
@@ -68,6 +68,7 @@ def pack(
         "format": FORMAT, "version": VERSION, "color_bits": color_bits, "sequences": {}, "members": {},
     }  # fmt: skip
     total = 0
+    remove_leftovers(archive.parent)
     with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as file:
         for name, folder in sequences.items():
             seq = Sequence.open(folder)
@@ -104,25 +105,44 @@ def read_manifest(archive: Path) -> dict[str, Any]:
     """The manifest of an archive.
 
     Raises:
-        JaxsrError: missing, not an archive of ours, another version.
+        JaxsrError: missing, not an archive of ours, another version, names that lead out of a folder.
     """
     try:
         with zipfile.ZipFile(archive) as file:
             manifest = json.loads(file.read("manifest.json"))
     except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
         raise JaxsrError("not an archive of a data set", where=archive, found=e) from e
+    if not isinstance(manifest, dict):
+        found = type(manifest).__name__
+        raise JaxsrError("not an archive of a data set", where=archive, expected="a manifest", found=found)
     if manifest.get("format") != FORMAT or manifest.get("version") != VERSION:
         found = f"{manifest.get('format')} {manifest.get('version')}"
         raise JaxsrError(
             "another kind of archive", where=archive, expected=f"{FORMAT} {VERSION}", found=found
         )
+    for key in ("sequences", "members"):
+        if not isinstance(manifest.get(key), dict):
+            raise JaxsrError("damaged manifest", where=archive, expected=f'"{key}": {{...}}')
+    for name in manifest["sequences"]:
+        if not _stays_inside(name):
+            raise JaxsrError(
+                "unsafe name of a sequence", where=archive, expected="a relative path", found=name
+            )
     return manifest
+
+
+def _stays_inside(name: str) -> bool:
+    """Whether a name is a path below the folder that it is joined to, on every system."""
+    for path in (PurePosixPath(name), PureWindowsPath(name)):
+        if path.anchor or not path.parts or ".." in path.parts:
+            return False
+    return True
 
 
 def verify(archive: Path) -> None:
     """Compare the whole with ARCHIVE.sha256, where that exists."""
     beside = archive.with_name(archive.name + ".sha256")
-    if beside.is_file() and beside.read_text().split()[0] != file_digest(archive):
+    if beside.is_file() and beside.read_text(errors="replace").split()[:1] != [file_digest(archive)]:
         raise JaxsrError("the checksum does not match", where=archive, expected=f"that of {beside.name}")
 
 

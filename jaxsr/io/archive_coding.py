@@ -25,6 +25,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsr.io.images import linear_to_srgb, srgb_to_linear
 from jaxsr.io.sequence import world_position
 from jaxsr.io.writing import FrameInfo
 
@@ -93,15 +94,6 @@ def camera_motion(
     y, x = np.mgrid[0:h, 0:w]
     p = np.stack([x + jitter[0], y + jitter[1]], -1)
     return np.clip(p - ((ndc + 1) / 2 * (w, h) - 0.5), -4096, 4096)
-
-
-def _srgb(x: np.ndarray) -> np.ndarray:
-    x = np.clip(x, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
-
-
-def _linear(x: np.ndarray) -> np.ndarray:
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
 
 
 # --- lossless coding of integer planes -------------------------------------------------------------------
@@ -183,7 +175,7 @@ def encode_frame(
     if "normal" in layers:
         codes["normal"] = quantise_normal(layers["normal"])
     if "base_color" in layers:
-        codes["base_color"] = np.rint(_srgb(layers["base_color"]) * 255).astype(np.uint8)
+        codes["base_color"] = np.rint(linear_to_srgb(layers["base_color"]) * 255).astype(np.uint8)
     for name in ("roughness", "metallic"):
         if name in layers:
             codes[name] = np.rint(np.clip(layers[name], 0, 1) * 255).astype(np.uint8)
@@ -226,7 +218,7 @@ def decode_frame(
     if "normal" in codes:
         layers["normal"] = restore_normal(codes["normal"], ~np.isfinite(depth))
     if "base_color" in codes:
-        layers["base_color"] = _linear(codes["base_color"] / 255)
+        layers["base_color"] = srgb_to_linear(codes["base_color"] / 255)
     for name in ("roughness", "metallic"):
         if name in codes:
             layers[name] = codes[name] / 255

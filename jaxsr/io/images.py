@@ -1,7 +1,7 @@
 """Single pictures: 8-bit PNG in and out, and any picture as linear colour.
 
 Display-referred images are float in [0, 1] (sRGB encoded), linear ones are scene-linear and unbounded. No
-tone mapping happens here: apply `jaxsr.ops.tone` before writing a PNG.
+tone mapping happens here: apply `jaxsr.ops.to_display` before writing a PNG.
 """
 
 from pathlib import Path
@@ -57,7 +57,7 @@ def read_png(path: str | Path) -> Float[np.ndarray, "h w 3"]:
             pixels = np.asarray(image if deep else image.convert("RGB"), np.float32)
     except FileNotFoundError as e:
         raise JaxsrError("no such file", where=path) from e
-    except (UnidentifiedImageError, OSError, SyntaxError, ValueError) as e:
+    except (UnidentifiedImageError, Image.DecompressionBombError, OSError, SyntaxError, ValueError) as e:
         raise JaxsrError("cannot be read as a picture", where=path, found=e, fix="write it again") from e
     if deep:
         return np.repeat(pixels[..., None] / np.float32(65535), 3, -1)
@@ -97,6 +97,12 @@ def read_color(path: str | Path) -> Float[np.ndarray, "h w 3"]:
 
 
 def srgb_to_linear(display: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Inverse of the sRGB transfer function (IEC 61966-2-1), float32 in [0, 1]."""
-    x = np.asarray(display, np.float32)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)
+    """Inverse of the sRGB transfer function (IEC 61966-2-1): linear values in [0, 1], of the same type."""
+    x = np.asarray(display)
+    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
+    """The sRGB transfer function (IEC 61966-2-1) of values clipped to [0, 1], of the same type."""
+    x = np.clip(linear, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
