@@ -158,7 +158,70 @@ def test_objects_move_and_the_camera_stands(tmp_path):
 def test_motion_that_was_not_exported(tmp_path):
     found = look(tmp_path, scales=(), spoil=change_motion(lambda m, w, h: 0 * m)).finding("motion")
     assert found.level == "bad"
-    assert "zero everywhere, yet the images change" in found.text
+    assert "zero everywhere, yet the camera moves points by" in found.text
+
+
+def test_motion_that_was_not_exported_while_the_camera_stands(tmp_path):
+    report = look(tmp_path, scales=(), still=True, spoil=change_motion(lambda m, w, h: 0 * m))
+    assert report.finding("motion").level == "bad"
+    assert "zero everywhere, yet the images change" in report.finding("motion").text
+
+
+def test_motion_that_was_not_exported_of_flat_images(tmp_path):
+    """Nothing in the pictures tells, but the cameras do."""
+
+    def spoil(name, index, layers):
+        for layer in layers:
+            layers[layer] = 0 * layers[layer] if layer == "motion" else np.ones_like(layers[layer])
+
+    report = look(tmp_path, scales=(), spoil=spoil)
+    assert report.finding("motion").level == "bad"
+    assert "the camera moves points by" in report.finding("motion").text
+
+
+def test_lr_motion_that_was_not_exported(tmp_path):
+    def spoil(name, index, layers):
+        if name == "x2":
+            layers["motion"] = 0 * layers["motion"]
+
+    found = look(tmp_path, spoil=spoil).finding("LR motion x2")
+    assert found.level == "bad"
+    assert found.text.startswith("zero everywhere")
+
+
+@pytest.mark.parametrize("layer", ["motion", "depth", "color"])
+@pytest.mark.parametrize("whole", [True, False], ids=["layer", "channel"])
+def test_missing_needed_layers_are_bad(tmp_path, layer, whole):
+    seq = make_sequence(tmp_path / "seq", frames=2, size=(32, 20))
+    channels, _ = read_exr(seq.path / "x2/0002.exr")
+    lost = [n for n in channels if n.startswith(f"{layer}.")][: None if whole else 1]
+    write_exr(seq.path / "x2/0002.exr", {n: x for n, x in channels.items() if n not in lost})
+    report = inspect(Sequence.open(seq.path, check=False))
+    assert report.finding("files").level == report.level == "bad"
+    assert f"x2/0002.exr: missing layer {layer!r}" in report.finding("files").text
+
+
+def test_nan_in_motion_alone_is_bad_and_no_missing_motion(tmp_path):
+    seq = make_sequence(tmp_path / "seq", frames=2, size=SIZE, scales=())
+    channels, _ = read_exr(seq.path / "hr/0002.exr")
+    motion = channels["motion.X"].copy()
+    motion[3, 4] = np.nan
+    write_exr(seq.path / "hr/0002.exr", channels | {"motion.X": motion})
+    report = inspect(Sequence.open(seq.path, check=False))
+    assert report.finding("values").level == report.level == "bad"
+    assert report.finding("motion").level == "ok"
+
+
+def test_damaged_pixels_do_not_disturb_the_output_for_machines(tmp_path, capsys):
+    seq = make_sequence(tmp_path / "seq", frames=2, size=SIZE)
+    path = seq.path / "hr/0002.exr"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 300] = b"\x55" * 300
+    path.write_bytes(data)
+    print(json.dumps(inspect(Sequence.open(seq.path, check=False)).to_json()))
+    back = json.loads(capsys.readouterr().out)
+    assert back["level"] == "bad"
+    assert "hr/0002.exr: the pixel data is damaged" in back["findings"][0]["text"]
 
 
 def test_random_motion_is_not_explained(tmp_path):

@@ -129,8 +129,12 @@ def motion_evidence(
         True: (previous, current, info_previous, info),
     }
     scale = normalise(_blur(features(current)))
+    solid = ~is_sky(current["depth"])[..., 0]
+    still_motion = static_motion(current["depth"], info, info_previous)[solid]
     evidence = MotionEvidence(
-        moves=bool(np.abs(current["motion"]).max(initial=0) > 1e-7), camera_px=0.0, image_change=0.0
+        moves=bool(np.abs(finite_or_zero(current["motion"])).max(initial=0) > 1e-7),
+        camera_px=float(np.median(np.linalg.norm(still_motion, axis=-1))) if solid.any() else 0.0,
+        image_change=0.0,
     )
     for forward, (here, there, info_here, info_there) in directions.items():
         f_here, f_there = (_blur(features(x)) * scale for x in (here, there))
@@ -288,6 +292,7 @@ LR_MOTIONS = {
     "HR pixels": lambda m, s, dj: m,
     "jitter counted in": lambda m, s, dj: m / s + dj,
     "jitter counted in, sign flipped": lambda m, s, dj: m / s - dj,
+    "zero everywhere: it was not exported": lambda m, s, dj: 0 * m,
 }
 
 

@@ -121,7 +121,10 @@ def judge_motion(evidence: list[cv.MotionEvidence]) -> tuple[Finding, cv.MotionC
     data: dict[str, Any] = {"pairs": len(evidence), "image_change": change, "camera_px": camera_px}
     if not any(e.moves for e in evidence):
         if camera_px > 0.05 or change > 0.05:
-            text = f"zero everywhere, yet the images change (the camera moves points by {camera_px:.2g} px)"
+            seen = (
+                f"the camera moves points by {camera_px:.2g} px" if camera_px > 0.05 else "the images change"
+            )
+            text = f"zero everywhere, yet {seen}"
             fix = ": it was not exported (Blender writes zeros when motion blur is on)"
             return Finding("motion", "bad", text + fix, data | {"convention": None}), None
         return Finding("motion", "warn", "cannot tell: nothing moves", data | {"convention": None}), None
