@@ -250,8 +250,50 @@ def test_bad_folders(folders, make):
     with pytest.raises(JaxsrError, match=words) as caught:
         compare([folders / "bright", bad], folders / "truth", folders / "out")
     assert "\n" not in str(caught.value)
-    assert not (folders / "out" / "report.html").exists()
-    assert not (folders / "out" / "metrics.json").exists()
+    assert not (folders / "out").exists()
+    assert not list(folders.glob(".*"))
+
+
+@pytest.mark.parametrize("kind", ["png", "exr"])
+def test_an_error_at_the_end_leaves_the_last_results_as_they_were(tmp_path, kind):
+    write_folder(tmp_path / "truth", kind=kind)
+    write_folder(tmp_path / "good", offset=0.1, kind=kind)
+    compare([tmp_path / "good"], tmp_path / "truth", tmp_path / "deep" / "out")
+    before = {p: p.read_bytes() for p in (tmp_path / "deep").rglob("*") if p.is_file()}
+    assert len(before) == (4 if kind == "png" else 10)
+    bad = write_folder(tmp_path / "bad", offset=0.2, kind="exr")
+    broken = frame(3)
+    broken[0, 0] = np.nan
+    write_exr(bad / "0003.exr", {c: broken[..., k] for k, c in enumerate("RGB")})
+    with pytest.raises(JaxsrError, match=r"bad/0003\.exr: the frame holds NaN"):
+        compare([tmp_path / "good", bad], tmp_path / "truth", tmp_path / "deep" / "out")
+    assert {p: p.read_bytes() for p in (tmp_path / "deep").rglob("*") if p.is_file()} == before
+
+
+def test_an_interrupted_comparison_leaves_nothing(folders):
+    def stop():
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        compare([folders / "exact"], folders / "truth", folders / "out", progress=lambda title, total: stop)
+    assert sorted(p.name for p in folders.iterdir()) == ["bright", "exact", "truth"]
+
+
+@pytest.mark.parametrize(
+    "numbers", [{"exposure": x} for x in (-1.0, 0.0, math.inf, math.nan)] + [{"fps": 0.0}, {"fps": math.nan}]
+)
+def test_numbers_are_checked_before_anything_is_read(tmp_path, numbers):
+    with pytest.raises(JaxsrError, match=f"{next(iter(numbers))}: must be a number above 0"):
+        compare([tmp_path / "none"], tmp_path / "none", tmp_path / "out", **numbers)
+    assert not list(tmp_path.iterdir())
+
+
+def test_out_that_cannot_be_a_folder(folders):
+    (folders / "file").write_text("mine")
+    for out in (folders / "file", folders / "file" / "below"):
+        with pytest.raises(JaxsrError, match="file"):
+            compare([folders / "exact"], folders / "truth", out)
+    assert (folders / "file").read_text() == "mine"
 
 
 def test_bad_truth_and_no_folders(folders):

@@ -6,10 +6,15 @@ may be a jaxsr sequence (its HR colour counts) or what `jaxsr upscale` wrote (it
 
 Frames are matched by the last number in the file name where all names of a folder have one, else by sorted
 name. Memory does not grow with the number of frames, apart from the small FLIP maps of the page.
+Everything is made in a temporary folder beside `out` and moved at the end: an error leaves `out` as it was.
 """
 
+import contextlib
+import dataclasses
+import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -190,11 +195,17 @@ def compare(
         What was measured; `rich_tables([section])` prints it.
 
     Raises:
-        JaxsrError: a folder is missing or empty, frames do not match, sizes differ, a file cannot be read.
+        JaxsrError: a number that makes no sense, a folder is missing or empty, frames do not match, sizes
+            differ, a file cannot be read or written. Nothing is written then.
     """
+    for what, value in (("exposure", exposure), ("fps", fps), ("max_megabytes", max_megabytes)):
+        if value is not None and not (math.isfinite(value) and value > 0):
+            raise JaxsrError("must be a number above 0", where=what, found=value)
     if not folders:
         raise JaxsrError("no folders to compare", fix="name at least one folder of frames")
     truth, out = Path(truth), Path(out)
+    if out.exists() and not out.is_dir():
+        raise JaxsrError("not a folder", where=out, fix="choose another --out")
     true = find_frames(truth)
     kind = "png" if true.files[0].suffix.lower() in _PLAIN else "exr"
     found = [find_frames(Path(folder), prefer=kind) for folder in folders]
@@ -206,23 +217,56 @@ def compare(
         exposure = FrameSequence.open(truth).exposure if is_sequence else 1.0
     starts = _starts(true)
     advance = progress("measuring", len(found) * len(true.files)) if progress else lambda: None
-    shown = _Shown(out, exposure)
-    tracks = [
-        _measured(name, frames, true, starts, shown, advance)
-        for name, frames in zip(names, found, strict=True)
-    ]
-    section = Section(
-        title=f"{truth.resolve().name}: {', '.join(names)}" if len(names) < 4 else truth.resolve().name,
-        frames=true.numbers or tuple(range(1, len(true.files) + 1)),
-        truths=[shown.path("truth", file) for file in true.files],
-        tracks=tracks,
-        exposure=exposure,
-        meta={"truth": str(truth), **{name: str(f) for name, f in zip(names, folders, strict=True)}},
-    )
     title = title or f"{' · '.join(names)} against {truth.resolve().name}"
-    write_report(out / "report.html", [section], title=title, meta=meta, fps=fps, max_megabytes=max_megabytes)
-    write_metrics(out, [section], title=title, meta=meta)
-    return section
+    with _staging(out) as folder:
+        shown = _Shown(folder, exposure)
+        section = Section(
+            title=f"{truth.resolve().name}: {', '.join(names)}" if len(names) < 4 else truth.resolve().name,
+            frames=true.numbers or tuple(range(1, len(true.files) + 1)),
+            truths=[shown.path("truth", file) for file in true.files],
+            tracks=[
+                _measured(name, frames, true, starts, shown, advance)
+                for name, frames in zip(names, found, strict=True)
+            ],
+            exposure=exposure,
+            meta={"truth": str(truth), **{name: str(f) for name, f in zip(names, folders, strict=True)}},
+        )
+        write_report(
+            folder / "report.html", [section], title=title, meta=meta, fps=fps, max_megabytes=max_megabytes
+        )
+        write_metrics(folder, [section], title=title, meta=meta)
+        _move(folder, out)
+    shown = shown._replace(out=out)
+    return dataclasses.replace(
+        section,
+        truths=[shown.path("truth", file) for file in true.files],
+        tracks=[
+            dataclasses.replace(track, images=[shown.path(f"frames/{name}", file) for file in frames.files])
+            for track, name, frames in zip(section.tracks, names, found, strict=True)
+        ],
+    )
+
+
+@contextlib.contextmanager
+def _staging(out: Path) -> Iterator[Path]:
+    """A temporary folder on the file system of `out`, gone at the end."""
+    place = next(p for p in out.absolute().parents if p.is_dir())
+    try:
+        with tempfile.TemporaryDirectory(
+            prefix=f".{out.name}.", suffix=".tmp", dir=place, ignore_cleanup_errors=True
+        ) as folder:
+            yield Path(folder)
+    except OSError as e:
+        raise JaxsrError("cannot write", where=out, found=e.strerror or e, fix="check the folder") from e
+
+
+def _move(folder: Path, out: Path) -> None:
+    """Move all files into `out`, over those of the same names: the pictures first, the page last."""
+    files = [path for path in folder.rglob("*") if path.is_file()]
+    for path in sorted(files, key=lambda p: (p.parent == folder, p.suffix == ".html")):
+        target = out / path.relative_to(folder)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        path.replace(target)
 
 
 class _Shown(NamedTuple):

@@ -39,7 +39,7 @@ class Timing:
     """Time of one frame. Compilation happens once and is never part of the median."""
 
     compile_s: float
-    """Seconds of the first call, compilation included."""
+    """Seconds of compilation alone, before the first call."""
     median_ms: float
     """Median time of one frame in milliseconds."""
     spread_ms: float
