@@ -186,6 +186,89 @@ def test_failure_shows_the_last_meaningful_line(tmp_path, monkeypatch):
     with pytest.raises(JaxsrError, match=r"Blender failed.*System is out of GPU memory.*blender\.log"):
         render(scene, tmp_path / "out", (1, 2))
     assert last_meaningful_line(noise) is None
+    assert [p.name for p in (tmp_path / "out").rglob("*")] == ["blender.log"], "only what the message names"
+
+
+@pytest.fixture
+def imitation(tmp_path):
+    """An executable in the place of Blender that renders by copying: for what needs no real pictures."""
+    script = tmp_path / "imitation.py"
+    script.write_text(IMITATION)
+    body = f"for job; do :; done\nexec {sys.executable} {script} $job"
+    return fake_blender(tmp_path, body)
+
+
+IMITATION = """
+import json, sys
+from pathlib import Path
+import numpy as np
+from jaxsr.io.exr import write_exr
+
+def say(event, **more):
+    print(json.dumps({"event": event, "cpu_seconds": 0.0, **more}), flush=True)
+
+job = json.loads(Path(sys.argv[1]).read_text())
+if "broken" in job["scene"]["blend"]:
+    say("error", what="cannot open", where=job["scene"]["blend"])
+    sys.exit(1)
+say("scene", scene_sha256="0", blender="5", samples=1, adaptive=0, denoise=False, bounces=1, size=[4, 2],
+    fps=24, exposure=1.0, frames=job["frames"], objects=0, instanced=[], instances=[])
+job |= json.loads(input())
+raw, plane = Path(job["out"]), np.ones((2, 4), np.float32)
+camera = {"world_from_view": np.eye(4).tolist(), "tan_half_fov": [1, 1], "lens_shift": [0, 0], "name": "c"}
+names = ["Depth.Z", "Vector.X", "Vector.Y", "Normal.X", "Normal.Y", "Normal.Z", "base_color.R",
+         "base_color.G", "base_color.B", "roughness.X", "metallic.X", "Object Index.X", "instance.X"]
+for f in range(job["frames"][0], job["frames"][1] + 1):
+    if f in job["skip"]:
+        continue
+    write_exr(raw / f"{f:04d}_hr_gbuffer.exr", {n: plane for n in names})
+    write_exr(raw / f"{f:04d}_hr_color.exr", {f"Combined.{c}": plane for c in "RGB"})
+    info = {"jitter_px": [0, 0], "cut": f == 5, "camera": camera, "previous": camera}
+    (raw / f"{f:04d}.json").write_text(json.dumps(info))
+    say("frame", frame=f)
+say("done")
+"""
+
+
+def test_ranges_rendered_one_after_the_other_are_joined(tmp_path, imitation):
+    scene, out = tmp_path / "a.blend", tmp_path / "out"
+    scene.write_bytes(b"")
+
+    def cuts(first, last):
+        seq = Sequence.open(render(scene, out, (first, last), scales=(), blender=imitation))
+        return {i.index: i.cut for i in seq.infos}
+
+    assert cuts(3, 6) == {3: True, 4: False, 5: True, 6: False}
+    before = (out / "hr" / "0004.exr").stat().st_mtime_ns
+    assert cuts(1, 6) == {1: True, 2: False, 3: False, 4: False, 5: True, 6: False}
+    assert (out / "hr" / "0004.exr").stat().st_mtime_ns == before, "what is whole is kept"
+    assert cuts(7, 8) == {1: True, 2: False, 3: False, 4: False, 5: True, 6: False, 7: False, 8: False}
+    assert cuts(10, 10)[10]
+
+
+def test_failures_before_the_first_frame_leave_nothing(tmp_path, imitation):
+    scene = tmp_path / "broken.blend"
+    scene.write_bytes(b"")
+    (tmp_path / "mine").mkdir()
+    for name in ("new", "mine"):
+        with pytest.raises(JaxsrError, match=r"broken\.blend: cannot open"):
+            render(scene, tmp_path / name, (1, 2), blender=imitation)
+    assert not (tmp_path / "new").exists()
+    assert not list((tmp_path / "mine").iterdir())
+
+
+def test_out_that_is_a_file(tmp_path, imitation):
+    scene, file = tmp_path / "a.blend", tmp_path / "file"
+    scene.write_bytes(b"")
+    file.write_text("mine")
+    with pytest.raises(JaxsrError, match="file: not a folder"):
+        render(scene, file, (1, 2), blender=imitation)
+    with pytest.raises(JaxsrError, match="cannot write"):
+        render(scene, file / "below", (1, 2), blender=imitation)
+    with pytest.raises(JaxsrError, match=r"blender\.log: cannot write"):
+        render(scene, tmp_path / "out", (1, 2), blender=imitation, log=file / "blender.log")
+    assert file.read_text() == "mine"
+    assert not (tmp_path / "out").exists()
 
 
 def test_bad_arguments(tmp_path):

@@ -2,6 +2,8 @@
 
 import json
 import re
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -312,6 +314,16 @@ def test_writer_refuses(tmp_path, hr, lr, message):
         writer(tmp_path).write_frame(
             frame_info(1, SIZE), layers(**hr), {s: layers(1, s, **more) for s, more in lr.items()}
         )
+
+
+def test_writing_needs_no_jax():
+    code = (
+        "import sys; sys.modules['jax'] = sys.modules['jaxtyping'] = None; "
+        "import jaxsr.io.writing, jaxsr.io.exr; "
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+    code = "import sys; import jaxsr.io.images; assert 'jax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_writer_arguments(tmp_path):

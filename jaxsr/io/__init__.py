@@ -1,5 +1,6 @@
-"""Files: OpenEXR, sequences on disk, PNG. NumPy arrays in and out; no JAX, no networks.
+"""Files: OpenEXR, sequences on disk, archives, PNG, renders. NumPy arrays in and out; no networks.
 
-`exr`, `writing` and `images` need only NumPy (and OpenEXR, Pillow), so that a renderer's own Python can
-write sequences; `sequence` reads them into the pytrees of `jaxsr.frames`.
+`exr` and `writing` need only NumPy and OpenEXR, so that a renderer's own Python can write sequences; `images`
+needs Pillow and jaxtyping too. The others read sequences into the pytrees of `jaxsr.frames`, whose types come
+from JAX.
 """

@@ -10,10 +10,11 @@ depth of field, transparent film and compositing. Not handled: cameras that are 
 shift, volumes, transparent surfaces (the G-buffer describes the first surface).
 """
 
+import contextlib
 import hashlib
 import json
 import shutil
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,7 +25,6 @@ from jaxsr.io.blender_convert import Instances, camera_from_json, convert_color,
 from jaxsr.io.blender_process import BlenderProcess, find_blender
 from jaxsr.io.exr import read_exr
 from jaxsr.io.writing import FrameInfo, SequenceWriter
-from jaxsr.ops.jitter import jitter_sequence
 
 JITTER_LENGTH = 32
 """Frame f has point `(f - 1) mod 32` of the Halton jitter, whatever range is rendered."""
@@ -90,6 +90,8 @@ def render(
         JaxsrError: no Blender, a scene that cannot be rendered as asked, a folder that holds another
             sequence, or a failure of Blender (with its last line).
     """
+    from jaxsr.ops.jitter import jitter_sequence  # late: it loads JAX
+
     scene, out = Path(scene).resolve(), Path(out)
     if scene.suffix not in (".blend", ".py") or not scene.is_file():
         found = "no such file" if not scene.exists() else scene.suffix or "a folder"
@@ -113,8 +115,10 @@ def render(
         "threads": threads,
         "attended": True,
     }
-    out.mkdir(parents=True, exist_ok=True)
-    with BlenderProcess(program, job, out / ".raw", Path(log) if log else out / "blender.log") as process:
+    if out.exists() and not out.is_dir():
+        raise JaxsrError("not a folder", where=out, fix="choose another folder for the sequence")
+    log = Path(log) if log else out / "blender.log"
+    with _tidied(out, log), BlenderProcess(program, job, out / ".raw", log) as process:
         described = process.scene()
         generator = {
             "tool": "jaxsr render",
@@ -138,7 +142,12 @@ def render(
             round_bits=round_bits,
         )
         first, last = described["frames"]
-        done = [f for f in range(first, last + 1) if writer.has(f)]
+        # A frame that began a range is a cut: it is made again when the frames before it come to be.
+        done = [
+            f
+            for f in range(first, last + 1)
+            if writer.has(f) and not (f > first and writer.is_cut(f) and not writer.has(f - 1))
+        ]
         key = {**job, "threads": None, "attended": None, "described": described}
         raw = _raw_folder(out / ".raw", json.dumps(key, sort_keys=True))
         process.answer({"skip": done, "out": str(raw)})
@@ -146,12 +155,27 @@ def render(
         for event in process.events():
             report(event)
             if event["event"] == "frame":
-                _take_over(
-                    raw, event["frame"], first, [s for s in scales if s > 1], described, position, writer
-                )
+                _take_over(raw, event["frame"], [s for s in scales if s > 1], described, position, writer)
     writer.close()
     shutil.rmtree(out / ".raw", ignore_errors=True)
     return out
+
+
+@contextlib.contextmanager
+def _tidied(out: Path, log: Path) -> Iterator[None]:
+    """After an error before anything was rendered, leave nothing but a log that the message names."""
+    had_log, had_out = log.exists(), out.exists()
+    try:
+        yield
+    except BaseException as e:
+        if not any(out.rglob("*.exr")) and not (out / "sequence.json").exists():
+            shutil.rmtree(out / ".raw", ignore_errors=True)
+            with contextlib.suppress(OSError):
+                if log.parent == out and not had_log and str(log) not in str(e):
+                    log.unlink(missing_ok=True)
+                if not had_out:
+                    out.rmdir()
+        raise
 
 
 def _check_arguments(
@@ -185,7 +209,6 @@ def _raw_folder(root: Path, key: str) -> Path:
 def _take_over(
     raw: Path,
     frame: int,
-    first: int,
     scales: Sequence[int],
     described: Mapping[str, Any],
     position: bool,
@@ -206,7 +229,7 @@ def _take_over(
         }
 
     writer.write_frame(
-        FrameInfo(frame, jitter, frame == first or info["cut"], *camera),
+        FrameInfo(frame, jitter, info["cut"] or not writer.has(frame - 1), *camera),
         layers("hr", (0.0, 0.0)),
         {s: layers(f"x{s}", jitter) for s in scales},
     )

@@ -1,5 +1,6 @@
 """Finding Blender, and running `blender_script.py` in it as a child process that ends with its parent."""
 
+import contextlib
 import importlib.util
 import json
 import os
@@ -89,13 +90,15 @@ class BlenderProcess:
 
     def __init__(self, program: Blender, job: Mapping[str, Any], folder: Path, log: Path):
         self.program, self.log = program, log
-        folder.mkdir(parents=True, exist_ok=True)
         self.job = folder / "job.json"
-        self.job.write_text(json.dumps(job))
+        with _writing(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self.job.write_text(json.dumps(job))
 
     def __enter__(self) -> "BlenderProcess":
-        self.log.parent.mkdir(parents=True, exist_ok=True)
-        self._log = self.log.open("wb")
+        with _writing(self.log):
+            self.log.parent.mkdir(parents=True, exist_ok=True)
+            self._log = self.log.open("wb")
         try:
             self._process = subprocess.Popen(
                 self.program.command(self.job),
@@ -163,6 +166,16 @@ class BlenderProcess:
             found=last_meaningful_line(self.log.read_text(errors="replace")) or f"exit status {code}",
             fix=f"see {self.log}",
         )
+
+
+@contextlib.contextmanager
+def _writing(path: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as e:
+        raise JaxsrError(
+            "cannot write", where=path, found=e.strerror or e, fix="choose another folder"
+        ) from e
 
 
 def last_meaningful_line(log: str) -> str | None:

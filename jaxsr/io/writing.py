@@ -170,6 +170,10 @@ class SequenceWriter:
             frame_file(self.path, r, index).exists() for r in self.resolutions
         )
 
+    def is_cut(self, index: int) -> bool:
+        """Whether the frame is listed as one that does not continue the one before it."""
+        return bool(self._frames.get(index, {}).get("cut"))
+
     def write_frame(
         self,
         info: FrameInfo,
