@@ -2,8 +2,9 @@
 
     python experiments/demo_results.py
 
-Runs the demo at x2 and x4; writes experiments/results/demo.json (every metric of every frame), demo.md (the
-tables of README) and docs/images/demo_<task>.png (crops: input, methods, truth).
+Runs the demo at x2 and x4; writes experiments/results/demo.json (every metric of every frame), demo.md
+(tables with spread and time), the results in README, and docs/images/demo_<task>.png (crops: input, methods,
+truth).
 """
 
 import json
@@ -13,14 +14,15 @@ import tempfile
 import time
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
-from jaxsr.cli import _progress
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description, run_demo
+from jaxsr.evaluation.progress import bars
 from jaxsr.evaluation.sample import unpack_sample
 from jaxsr.evaluation.tables import Section, as_json, best, cell, duration, header, summary
 from jaxsr.io.exr import atomic_path
@@ -33,12 +35,13 @@ IMAGES = ROOT / "docs" / "images"
 LABELS = {
     "super-resolution": {},
     "extrapolation": {
-        "nearest": "nearest, last frame held",
-        "bilinear": "bilinear, last frame held",
-        "taau": "taau, plain warp",
+        "nearest": "`nearest` (last frame held)",
+        "bilinear": "`bilinear` (last frame held)",
+        "taau": "`taau` (plain warp)",
     },
 }
 CROP = (64, 40)
+BEGIN, END = "<!-- results of experiments/demo_results.py -->", "<!-- end of results -->"
 
 
 @dataclass(frozen=True)
@@ -67,11 +70,44 @@ def table(sections: list[Section], task: str) -> list[str]:
             for key in keys:
                 text = cell(summary(track, key, subset), key)
                 cells.append(f"**{text}**" if track.name in best(section, key, subset) else text)
-            name = LABELS[task].get(track.name, track.name)
+            name = LABELS[task].get(track.name, f"`{track.name}`")
             time_ms = duration(track.timing.median_ms) if track.timing else ""
             scene = str(section.meta["sequence"]).split("-")[0]
             lines.append(f"| {scene} x{section.meta['scale']} | {name} | {' | '.join(cells)} | {time_ms} |")
     return lines
+
+
+def readme_block(document: dict[str, Any], scale: int = 2) -> str:
+    """The results of README: a row a method, a column a scene, from the numbers in demo.json."""
+    keys = ("psnr", "ssim", "flip", "tpsnr")
+    digits = {"psnr": 2, "ssim": 3, "flip": 3, "tpsnr": 2}
+    lines = []
+    for task, title in (
+        ("super-resolution", f"Super-resolution x{scale}, all frames"),
+        ("extrapolation", f"Every second frame extrapolated from x{scale} history, extrapolated frames only"),
+    ):
+        subset = "extrapolated" if task == "extrapolation" else "all"
+        chosen = [
+            s
+            for s in document["sections"]
+            if s["meta"]["scale"] == scale and any(s["extrapolated"]) == (task == "extrapolation")
+        ]
+        scenes = [s["meta"]["sequence"].split("-")[0] for s in chosen]
+        lines += [
+            f"{title} (PSNR in dB · SSIM · FLIP · temporal PSNR in dB):",
+            "",
+            f"| method | {' | '.join(scenes)} |",
+            "|---|" + "---|" * len(scenes),
+        ]
+        for k, track in enumerate(chosen[0]["tracks"]):
+            cells = []
+            for section in chosen:
+                found = section["tracks"][k]["summary"][subset]
+                cells.append(" · ".join(f"{found[key]['mean']:.{digits[key]}f}" for key in keys))
+            name = LABELS[task].get(track["name"], f"`{track['name']}`")
+            lines.append(f"| {name} | {' | '.join(cells)} |")
+        lines.append("")
+    return "\n".join(lines)
 
 
 def busiest(truth: np.ndarray, rivals: list[np.ndarray]) -> tuple[int, int]:
@@ -89,7 +125,8 @@ def strip(section: Section, frame: int) -> np.ndarray:
     i = list(section.frames).index(frame)
     truth = np.asarray(section.truths[i])
     tracks = [t for t in section.tracks if t.name not in ("nearest", "bicubic")]
-    images = {LABELS[task_of(section)].get(t.name, t.name): np.asarray(t.images[i]) for t in tracks}
+    labels = {n: label.replace("`", "") for n, label in LABELS[task_of(section)].items()}
+    images = {labels.get(t.name, t.name): np.asarray(t.images[i]) for t in tracks}
     x, y = busiest(truth, list(images.values()))
     (w, h), zoom = CROP, 4
     given = section.inputs[i]
@@ -127,7 +164,7 @@ def picture(sections: list[Section], task: str, frame: int) -> np.ndarray:
 def main(config: Config) -> None:
     start = time.time()
     sections: list[Section] = []
-    with tempfile.TemporaryDirectory() as folder, _progress() as progress:
+    with tempfile.TemporaryDirectory() as folder, bars() as progress:
         for scale in config.scales:
             paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)
             sections += run_demo(Path(folder) / f"x{scale}", paths, scale=scale, progress=progress)
@@ -159,6 +196,13 @@ def main(config: Config) -> None:
     for task in LABELS:
         shown = [s for s in sections if s.meta["scale"] == (4 if task == "super-resolution" else 2)]
         write_png(IMAGES / f"demo_{task}.png", picture(shown, task, config.frame))
+    readme = (ROOT / "README.md").read_text()
+    before, _, rest = readme.partition(BEGIN)
+    _, _, after = rest.partition(END)
+    if not after:
+        raise JaxsrError("no place for the results", where="README.md", expected=f"{BEGIN} and {END}")
+    with atomic_path(ROOT / "README.md") as temporary:
+        temporary.write_text(f"{before}{BEGIN}\n{readme_block(document)}{END}{after}")
     print("\n".join(lines))
 
 

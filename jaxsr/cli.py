@@ -7,56 +7,16 @@ that `jaxsr --help` answers at once.
 import json as json_module
 import os
 import sys
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import tyro
 from tyro.conf import Positional
 
 from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.progress import bars
 
 app = tyro.extras.SubcommandApp()
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[str, int], Callable[[], Any]]]:
-    """A bar with rate and remaining time; gives a function that starts a bar and returns its `advance`."""
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
-
-    class RateColumn(ProgressColumn):
-        def render(self, task: Task) -> Text:
-            speed = task.finished_speed or task.speed
-            return Text("" if speed is None else f"{speed:.1f}/s", style="cyan")
-
-    columns = (
-        TextColumn("{task.description:>9}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        RateColumn(),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-
-        def start(title: str, total: int) -> Callable[[], Any]:
-            task = bar.add_task(title, total=total)
-            return lambda: bar.advance(task)
-
-        yield start
 
 
 @app.command
@@ -78,7 +38,7 @@ def demo(
     from jaxsr.evaluation.sample import unpack_sample
     from jaxsr.evaluation.tables import rich_tables
 
-    with _progress() as progress:
+    with bars() as progress:
         sequences = unpack_sample(out / "sample", "test", scenes, scale, progress)
         sections = run_demo(out, sequences, scale=scale, progress=progress)
     console = Console()
@@ -140,7 +100,7 @@ def compare(
     from jaxsr.evaluation.demo import description
     from jaxsr.evaluation.tables import rich_tables
 
-    with _progress() as progress:
+    with bars() as progress:
         section = compare_folders(
             folders, truth, out, exposure=exposure, fps=fps, meta=description(), progress=progress
         )
@@ -172,7 +132,7 @@ def upscale(
     from jaxsr.io.sequence import Sequence
 
     opened = Sequence.open(sequence)
-    with _progress() as progress:
+    with bars() as progress:
         _, timing = upscale_sequence(
             opened,
             find_method(method),

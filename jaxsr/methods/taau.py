@@ -21,7 +21,7 @@ beat.
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -109,29 +109,30 @@ def estimate(
     x = (jnp.arange(w, dtype=image.dtype) + 0.5) / scale - 0.5 - jitter_px[0]
     middle_y, middle_x = jnp.floor(y + 0.5), jnp.floor(x + 0.5)
 
-    def taps(j: Array) -> Iterator[tuple[Array, Array, Array]]:
+    def taps(values: Array, j: Array) -> Iterator[tuple[Array, Array]]:
         at_y = middle_y + j.astype(image.dtype)
-        rows = jnp.clip(at_y, 0, image.shape[0] - 1).astype(jnp.int32)
-        line = image[rows]
+        line = values[jnp.clip(at_y, 0, image.shape[0] - 1).astype(jnp.int32)]
         for i in (-1, 0, 1):
             columns = jnp.clip(middle_x + i, 0, image.shape[1] - 1).astype(jnp.int32)
-            values = line[:, columns]
             squared = ((at_y - y) ** 2)[:, None, None] + ((middle_x + i - x) ** 2)[None, :, None]
-            log_alike = alike(values[..., c:])
-            yield values[..., :c], squared, log_alike
+            yield line[:, columns], squared
 
     def log_kernel(squared: Array, log_alike: Array) -> Array:
         return log_alike - squared / (2 * options.kernel_sigma**2)
 
     # Loops over rows, not unrolled sums: XLA would gather anew for every result that uses a sample.
-    def most(best: tuple[Array, Array], j: Array) -> tuple[tuple[Array, Array], None]:
-        for _, squared, log_alike in taps(j):
+    def most(best: tuple[Array, Array], j: Array) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
+        found = []
+        for features, squared in taps(image[..., c:], j):
+            log_alike = alike(features)
             best = jnp.maximum(best[0], log_kernel(squared, log_alike)), jnp.maximum(best[1], log_alike)
-        return best, None
+            found.append(log_alike)
+        return best, tuple(found)
 
-    def add(carry: tuple[Array, ...], j: Array) -> tuple[tuple[Array, ...], None]:
+    def add(carry: tuple[Array, ...], row: tuple[Array, Any]) -> tuple[tuple[Array, ...], None]:
         total, color, low, high, confidence = carry
-        for values, squared, log_alike in taps(j):
+        j, found = row
+        for (values, squared), log_alike in zip(taps(image[..., :c], j), found, strict=True):
             # Relative to the best: where every sample is of another surface, the least bad one counts.
             weight = jnp.exp(log_kernel(squared, log_alike) - best)
             total, color = total + weight, color + weight * values
@@ -144,9 +145,9 @@ def estimate(
 
     rows = jnp.array((-1, 0, 1))
     one, three = jnp.zeros((h, w, 1), image.dtype), jnp.zeros((h, w, c), image.dtype)
-    best, best_alike = jax.lax.scan(most, (one - jnp.inf, one - jnp.inf), rows)[0]
+    (best, best_alike), found = jax.lax.scan(most, (one - jnp.inf, one - jnp.inf), rows)
     start: tuple[Array, ...] = (one, three, three + jnp.inf, three - jnp.inf, one)
-    total, color, low, high, confidence = jax.lax.scan(add, start, rows)[0]
+    total, color, low, high, confidence = jax.lax.scan(add, start, (rows, found))[0]
     return Estimate(color / total, low, high, confidence)
 
 

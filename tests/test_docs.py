@@ -1,0 +1,56 @@
+"""What README promises: commands in the form that CI relies on, numbers of the committed results."""
+
+import json
+import re
+from pathlib import Path
+
+from experiments.demo_results import BEGIN, END, readme_block
+
+ROOT = Path(__file__).resolve().parent.parent
+README = (ROOT / "README.md").read_text()
+
+
+def test_one_command_under_each_heading():
+    for heading in ("Run it", "Test it"):
+        section = README.split(f"## {heading}\n")[1].split("\n## ")[0]
+        blocks = re.findall(r"```sh\n(.*?)```", section, re.S)
+        assert len(blocks) == 1
+        assert len(blocks[0].strip().splitlines()) == 1
+
+
+def test_results_are_those_of_the_committed_run():
+    document = json.loads((ROOT / "experiments/results/demo.json").read_text())
+    assert README.split(BEGIN)[1].split(END)[0].strip() == readme_block(document).strip()
+
+
+def test_better_methods_are_better_on_every_scene_and_scale():
+    """The claims of README: the temporal method over interpolation, the guided over the plain warp."""
+    document = json.loads((ROOT / "experiments/results/demo.json").read_text())
+    assert len(document["sections"]) == 12
+    for section in document["sections"]:
+        subset = "extrapolated" if any(section["extrapolated"]) else "all"
+        psnr = {t["name"]: t["summary"][subset]["psnr"]["mean"] for t in section["tracks"]}
+        assert psnr["taau"] > max(psnr["nearest"], psnr["bilinear"])
+        assert psnr["guided-taau"] > psnr["taau"]
+        if subset == "extrapolated":
+            assert psnr["guided"] > psnr["taau"]
+
+
+def test_links_of_the_documents_lead_somewhere():
+    for page in [ROOT / "README.md", *(ROOT / "docs").glob("*.md"), *(ROOT / "benchmarks").glob("*.md")]:
+        for target in re.findall(r"\]\(([^)#:]+)\)", page.read_text()):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_the_example_of_readme_runs():
+    import jax.numpy as jnp
+
+    code = re.search(r"```python\n(.*?)```", README, re.S)
+    assert code
+    scope: dict = {}
+    exec(code.group(1), scope)  # our own page
+    image, confidence = scope["extrapolate"](
+        *(jnp.full((8, 8, 3), 0.5) for _ in range(5)), jnp.zeros((8, 8, 2))
+    )
+    assert image.shape == (8, 8, 3)
+    assert float(confidence.min()) == 1.0
