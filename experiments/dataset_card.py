@@ -45,8 +45,8 @@ Training and test clips have camera paths, scene seeds and layouts of their own:
 ## Noise of the truth
 
 Two renders with different seeds; PSNR of display-referred colour with half their mean squared difference,
-which estimates one render's distance from the noiseless image. Differences between methods near or above this
-number mean nothing.
+which estimates one render's distance from the noiseless image. For denoised clips the bias of the denoiser,
+which both renders share, is not in it. Differences between methods near or above this number mean nothing.
 
 | clip | samples | floor (dB) | frames | size |
 |---|---|---|---|---|
@@ -65,7 +65,7 @@ def _size(folder: Path) -> int:
 
 
 def _strip(sequences: list[Sequence], path: Path, width: int = 256) -> None:
-    """First frames side by side, every few pixels of each."""
+    """The middle frame of each side by side, every few pixels of it."""
     shown = []
     for seq in sequences:
         image = np.asarray(to_display(seq.truth(len(seq) // 2), seq.exposure))

@@ -1,4 +1,4 @@
-"""The data sets of the three scenes: rendered, measured, described and packed. Every verb resumes.
+"""The data sets of the three scenes: rendered, measured, described and packed.
 
     python experiments/make_datasets.py render --set sample|train|test [--budget-minutes N] [--out DIR]
     python experiments/make_datasets.py floor [--scenes bunker forest docks]
@@ -7,7 +7,8 @@
     python experiments/make_datasets.py unpack OUT [--archive FILE] [--search DIR]
 
 Sequences lie at `DIR/<set>/<scene>-<split>-<clip>`. `render` and `unpack` look for an archive (`*.jsrz`) in
-`--search`, then in `../shared/datasets` beside the repository, and never render what an archive holds.
+`--search`, then in `../shared/datasets` beside the repository, and never render what an archive holds; both
+resume. `floor` goes on clip by clip, but measures again what is there; `card` and `pack` begin anew.
 Training and test clips have camera paths and scene layouts of their own: they share no frames. All is
 deterministic for a seed, whatever the number of threads.
 """
@@ -16,11 +17,10 @@ import json
 import math
 import os
 import platform
-import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
@@ -44,6 +44,7 @@ from rich.progress import (  # noqa: E402
 )
 
 from experiments import dataset_card  # noqa: E402
+from experiments.provenance import commit  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.io import blender  # noqa: E402
 from jaxsr.io.archive import pack, read_manifest, unpack_sequence, verify  # noqa: E402
@@ -183,10 +184,20 @@ def is_complete(folder: Path, clip: Clip, config: Render) -> bool:
     """Whether all frames are there, as the configuration asks for them."""
     if not (folder / "sequence.json").is_file():
         return False
-    seq = Sequence.open(folder)
+    try:
+        seq = Sequence.open(folder)
+    except (
+        JaxsrError
+    ):  # killed between the files of a frame and its entry: the writer resumes, or says what is wrong
+        return False
     same = seq.size == size_of(config) and set(config.scales) <= set(seq.scales)
-    same = same and config.samples in (None, seq.generator.get("samples"))
+    same = same and _same_render(seq.generator, config)
     return same and set(range(1, clip.frames + 1)) <= {info.index for info in seq.infos}
+
+
+def _same_render(generator: Mapping[str, Any], config: Render) -> bool:
+    """Whether what made a sequence had the seed and the samples that are asked for."""
+    return generator.get("seed") == config.seed and config.samples in (None, generator.get("samples"))
 
 
 def find_archives(search: Path | None) -> list[Path]:
@@ -198,7 +209,7 @@ def find_archives(search: Path | None) -> list[Path]:
 
 
 def from_archive(config: Render, clip: Clip, folder: Path) -> bool:
-    """Unpacks the clip if an archive holds it at this size; tells whether it did."""
+    """Unpacks the clip if an archive holds it as it is asked for; tells whether it did."""
     for archive in find_archives(config.search):
         manifest = read_manifest(archive)
         name = f"{config.set}/{clip.name}"
@@ -207,7 +218,7 @@ def from_archive(config: Render, clip: Clip, folder: Path) -> bool:
             continue
         if not set(config.scales) <= set(head["scales"]):
             continue
-        if config.samples not in (None, head["generator"].get("samples")):
+        if not _same_render(head["generator"], config):
             continue
         unpack_sequence(archive, manifest, name, folder)
         return True
@@ -309,13 +320,6 @@ def device() -> str:
     return f"{model}, {os.cpu_count()} cores"
 
 
-def commit() -> str:
-    done = subprocess.run(
-        ["git", "-C", str(ROOT), "describe", "--always", "--dirty"], capture_output=True, text=True
-    )
-    return done.stdout.strip() or "unknown"
-
-
 # --- noise floor -----------------------------------------------------------------------------------------
 
 
@@ -338,7 +342,8 @@ def _colors(
         "size": config.size, "scales": [], "samples": config.samples, "seed": seed, "threads": config.threads,
         "jitter_px": [[0.0, 0.0]], "color_only": True, "attended": True, "out": str(folder),
     }  # fmt: skip
-    with BlenderProcess(find_blender(config.blender), job, folder, folder / "blender.log") as process:
+    log = CACHE / "logs" / f"floor-{clip.name}-{seed}.log"
+    with BlenderProcess(find_blender(config.blender), job, folder, log) as process:
         described = process.scene()
         process.answer({})
         for event in process.events():
@@ -452,7 +457,7 @@ def main(arguments: list[str] | None = None) -> int:
         else:
             unpack_set(config, console)
     except JaxsrError as e:
-        console.print(f"error: {e}", style="red", markup=False, highlight=False)
+        console.print(f"error: {e}", style="red", markup=False, highlight=False, soft_wrap=True)
         return 2
     except KeyboardInterrupt:
         console.print("stopped; run again to go on")

@@ -17,7 +17,7 @@ Test frames are not touched. Writes experiments/results/tune_<what>.json, .md an
 
 import json
 import platform
-import subprocess
+import sys
 import tempfile
 import time
 from collections.abc import Callable, Sequence
@@ -45,7 +45,11 @@ from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 
-RESULTS = Path(__file__).resolve().parent / "results"
+ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+from experiments.provenance import commit  # noqa: E402
+
+RESULTS = ROOT / "experiments" / "results"
 
 SIGMA_GUIDE = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)
 SIGMA_SPACE = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.4, 2.0, 4.0)
@@ -251,16 +255,10 @@ def main(config: Config) -> None:
             result = tune_reprojection(pairs)
         else:
             result = tune_taau(sequences, config.rounds)
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"],
-        cwd=Path(__file__).parent,
-        capture_output=True,
-        text=True,
-        check=False,
-    ).stdout.strip()
+    state = commit()
     meta = description(
         script=f"experiments/tune_classical.py {config.what}",
-        commit=commit,
+        commit=state,
         processor=platform.processor() or platform.machine(),
         seconds=round(time.time() - start),
         sequences=[f"{s.name}: {len(s)} frames {s.size[0]}x{s.size[1]}" for s in sequences],
@@ -272,7 +270,7 @@ def main(config: Config) -> None:
     lines = [
         f"# Constants of {'guided reprojection' if config.what == 'reprojection' else 'TAAU'}",
         "",
-        f"`{meta['script']}` at {commit} on {meta['date']}, {meta['device']}, {meta['seconds']} s; "
+        f"`{meta['script']}` at {state} on {meta['date']}, {meta['device']}, {meta['seconds']} s; "
         f"training frames: {', '.join(meta['sequences'])}. PSNR of display colour, whole frames.",
         "",
         *report(config, result),

@@ -1,7 +1,10 @@
 """Archives of sequences (round trip within the stated errors, damage, size) and the data-set script."""
 
 import json
+import re
+import subprocess
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +14,7 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from experiments import make_datasets as md
+from experiments.provenance import commit
 from jaxsr.errors import JaxsrError
 from jaxsr.io import archive
 from jaxsr.io.archive_coding import decode_plane, encode_plane, quantise_normal, restore_normal
@@ -268,6 +272,60 @@ def test_render_takes_what_an_archive_has_and_needs_no_blender(packed, tmp_path,
     md.render_set(config, quiet())  # complete: nothing to do
 
 
+def test_another_seed_is_neither_complete_nor_taken_from_an_archive(packed, tmp_path, monkeypatch):
+    source, file = packed
+    clip = md.Clip("bunker", "train", 0, 3)
+    config = md.Render(set="train", size=SIZE, scales=(2,), search=file)
+    monkeypatch.setattr(md, "SHARED", tmp_path / "none")
+    assert md.is_complete(source, clip, config)
+    for other in (replace(config, seed=1), replace(config, samples=5)):
+        assert not md.is_complete(source, clip, other)
+        assert not md.from_archive(other, clip, tmp_path / "out")
+    assert md.from_archive(config, clip, tmp_path / "out")
+
+
+def test_a_render_killed_between_a_frame_and_its_entry_is_not_complete(packed, tmp_path):
+    source, _ = packed
+    head = json.loads((source / "sequence.json").read_text())
+    (source / "sequence.json").write_text(json.dumps(head | {"frames": head["frames"][:2]}))
+    with pytest.raises(JaxsrError, match="not in sequence"):
+        Sequence.open(source)
+    config = md.Render(set="train", size=SIZE, scales=(2,))
+    assert not md.is_complete(source, md.Clip("bunker", "train", 0, 3), config)
+    assert not md.is_complete(source, md.Clip("bunker", "train", 0, 2), config)
+    write_sequence(source)  # what the renderer does: it resumes
+    assert md.is_complete(source, md.Clip("bunker", "train", 0, 3), config)
+
+
+def test_a_failed_floor_keeps_the_log_that_it_names(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(md, "CACHE", tmp_path / "cache")
+    program = tmp_path / "blender"
+    program.write_text(
+        '#!/bin/sh\n[ "$1" = --version ] && echo Blender 5.0.1 && exit\necho out of memory >&2\nexit 1\n'
+    )
+    program.chmod(0o755)
+    assert md.main(["floor", "--blender", str(program), "--results", str(tmp_path / "floors.json")]) == 2
+    message = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error: ")]
+    assert len(message) == 1, "one line"
+    log = Path(message[0].split("see ")[1])
+    assert "out of memory" in message[0]
+    assert log.read_text() == "out of memory\n"
+    assert not (tmp_path / "floors.json").exists()
+
+
+def test_commit_of_a_result(tmp_path):
+    assert commit(tmp_path) == "unknown"
+    subprocess.run(["git", "init", "-q", tmp_path], check=True)
+    (tmp_path / "a").write_text("1")
+    subprocess.run(["git", "-C", tmp_path, "add", "a"], check=True)
+    who = ["-c", "user.name=n", "-c", "user.email=e@example.org"]
+    subprocess.run(["git", "-C", tmp_path, *who, "commit", "-qm", "m"], check=True)
+    clean = commit(tmp_path)
+    assert re.fullmatch("[0-9a-f]{4,}", clean)
+    (tmp_path / "a").write_text("2")
+    assert commit(tmp_path) == f"{clean}-dirty"
+
+
 def test_budget_ends_before_the_next_clip(tmp_path, monkeypatch):
     monkeypatch.setattr(md, "SHARED", tmp_path)
     config = md.Render(set="test", budget_minutes=0.0, out=tmp_path / "out")
@@ -310,5 +368,6 @@ def test_pack_unpack_and_card_from_the_command_line(tmp_path, monkeypatch, capsy
     assert "| test | docks-test-0 | 3 | 16x8 | x2 | 4 | no |" in card
     assert "| docks-test-0 | 64 | 41.5 | 1: 41.5 | 384x216 |" in card
     assert "12 CPU seconds (1 sequences" in card
+    assert "bias of the denoiser" in card
     assert (tmp_path / "docs" / "images" / "data_test.png").is_file()
     assert md.main(["card", "--out", str(tmp_path / "nothing")]) == 2
