@@ -1,3 +1,5 @@
+from fractions import Fraction
+from math import floor
 from pathlib import Path
 
 import jax
@@ -48,6 +50,18 @@ def test_resize_is_the_loop(size, new, mode, seed):
     image = _random(seed, *size, 2)
     result = ops.resize(image, new, mode)
     np.testing.assert_allclose(result, reference.resize(image, new, mode), atol=2e-6)
+
+
+# Sizes of which a new pixel lies exactly half way between two old ones, where floats go wrong easily.
+@pytest.mark.parametrize(("old", "new"), [(2, 49), (10, 49), (6, 98), (14, 49), (3, 4), (7, 3), (1, 5)])
+def test_nearest_is_the_exact_rational(old, new):
+    half = Fraction(1, 2)
+    positions = [(x + half) * old / new - half for x in range(new)]
+    nearest = [min(max(floor(p + half), 0), old - 1) for p in positions]
+    row = jnp.arange(old, dtype=jnp.float32)[None, :, None]
+    np.testing.assert_array_equal(ops.resize(row, (1, new), "nearest")[0, :, 0], nearest)
+    linear = [float(min(max(p, Fraction(0)), Fraction(old - 1))) for p in positions]
+    np.testing.assert_allclose(ops.resize(row, (1, new))[0, :, 0], linear, atol=1e-5)
 
 
 @given(
@@ -122,6 +136,22 @@ def test_sky_does_not_spread(mode):
         ops.pixel_grid(4, 4)
     )
     assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_permuting_channels_commutes(mode):
+    image, positions, order = _random(10, 5, 3, 3), 5 * _random(11, 4, 6, 2), [2, 0, 1]
+    result = ops.sample(image, positions, mode=mode)
+    np.testing.assert_array_equal(ops.sample(image[..., order], positions, mode=mode), result[..., order])
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_half_precision_is_summed_in_single(mode):
+    image, positions = jnp.asarray(_random(12, 5, 3, 2), jnp.float16), 3 + 2 * _random(13, 7, 2)
+    result = ops.sample(image, positions, mode=mode)
+    assert result.dtype == jnp.float16
+    expected = ops.sample(image.astype(jnp.float32), positions, mode=mode)
+    np.testing.assert_array_equal(result, expected.astype(jnp.float16))
 
 
 @pytest.mark.parametrize("mode", ["nearest", "bicubic"])

@@ -65,20 +65,11 @@ def kernel_taps(fraction, mode: str, xnp=jnp) -> list:
     ]
 
 
-def _first_tap(position, mode: str, xnp=jnp):
-    """The pixel of the first tap, and the fraction for `kernel_taps`."""
-    base = xnp.floor(position + 0.5) if mode == "nearest" else xnp.floor(position)
-    return base - (1 if mode == "bicubic" else 0), position - base
-
-
-def _axis_taps(
-    position: Float[Array, "*n"], size: int, mode: str, boundary: str
+def axis_taps(
+    base: Int[Array, "*n"], fraction: Float[Array, "*n"], size: int, mode: str, boundary: str
 ) -> list[tuple[Array, Array]]:
-    """Clamped indices and weights of the taps of one axis."""
-    # Far or NaN positions would overflow the integers; four pixels outside, all taps are outside as well.
-    position = jnp.clip(jnp.where(jnp.isnan(position), -4.0, position), -4.0, size + 3.0)
-    first, fraction = _first_tap(position, mode)
-    first = jax.lax.stop_gradient(first).astype(jnp.int32)
+    """Clamped indices and weights of the taps of one axis, for samples `fraction` past the pixels `base`."""
+    first = base - (1 if mode == "bicubic" else 0)
     taps = []
     for k, weight in enumerate(kernel_taps(fraction, mode)):
         index = first + k
@@ -86,6 +77,51 @@ def _axis_taps(
             weight = jnp.where((index >= 0) & (index < size), weight, 0)
         taps.append((jnp.clip(index, 0, size - 1), weight))
     return taps
+
+
+@jax.custom_jvp
+def _weighted(weight: Float[Array, "*n 1"], tap: Float[Array, "*n c"]) -> Float[Array, "*n c"]:
+    """`weight * tap`, and 0 where the weight is 0: the plain product makes NaN of 0 and infinity."""
+    return jnp.where(weight != 0, weight * tap, 0)
+
+
+@_weighted.defjvp
+def _weighted_jvp(primals: tuple[Array, Array], tangents: tuple[Array, Array]) -> tuple[Array, Array]:
+    weight, tap = primals
+    # A finite tap of weight 0 has a slope all the same; an infinite one would make NaN of a zero cotangent.
+    slope = jnp.where(jnp.isfinite(tap), tap, 0)
+    return _weighted(weight, tap), tangents[0] * slope + weight * tangents[1]
+
+
+def weigh_taps(
+    image: Float[Array, "h w c"], columns: list[tuple[Array, Array]], rows: list[tuple[Array, Array]]
+) -> Float[Array, "*n c"]:
+    """The weighted sum of both axes' taps; one of zero weight adds nothing, even where it is infinite.
+
+    Half-precision images are summed in the precision of the weights; the result has that of the image.
+    """
+    dtype = np.promote_types(image.dtype, columns[0][1].dtype)
+    total = None
+    for y, weight_y in rows:
+        for x, weight_x in columns:
+            weight = (weight_y * weight_x)[..., None].astype(dtype)
+            product = _weighted(weight, gather_pixels(image, x, y).astype(dtype))
+            total = product if total is None else total + product
+    assert total is not None
+    return total.astype(image.dtype)
+
+
+def _split(position, mode: str, xnp=jnp):
+    """The whole pixel before each position ("nearest": the nearest, halves round up), and the fraction."""
+    base = xnp.floor(position + 0.5) if mode == "nearest" else xnp.floor(position)
+    return base, position - base
+
+
+def _taps_at(position: Float[Array, "*n"], size: int, mode: str, boundary: str) -> list[tuple[Array, Array]]:
+    # Far or NaN positions would overflow the integers; four pixels outside, all taps are outside as well.
+    position = jnp.clip(jnp.where(jnp.isnan(position), -4.0, position), -4.0, size + 3.0)
+    base, fraction = _split(position, mode)
+    return axis_taps(jax.lax.stop_gradient(base).astype(jnp.int32), fraction, size, mode, boundary)
 
 
 @functools.partial(jax.jit, static_argnames=("mode", "boundary"))
@@ -102,7 +138,8 @@ def sample(
         image: any range, any number of channels; batch axes lead.
         positions_px: (x, y) in pixels of `image`, with the batch axes of `image` and then any others.
             NaN counts as far outside, to the upper left.
-        mode: "nearest" (halves round up), "bilinear" or "bicubic".
+        mode: "nearest" (halves round up; `warping.backward_warp` rounds the motion instead, half to even),
+            "bilinear" or "bicubic".
         boundary: taps outside the image repeat its border ("clamp") or are "zero".
 
     Raises:
@@ -112,20 +149,9 @@ def sample(
 
     def one(image: Array, positions: Array) -> Array:
         height, width, _ = image.shape
-        columns = _axis_taps(positions[..., 0], width, mode, boundary)
-        rows = _axis_taps(positions[..., 1], height, mode, boundary)
-        total = None
-        for y, weight_y in rows:
-            for x, weight_x in columns:
-                tap = gather_pixels(image, x, y)
-                weight = (weight_y * weight_x)[..., None].astype(image.dtype)
-                # 0 * inf is NaN, in the value and, times a zero cotangent, in the gradient of the weight.
-                finite = jnp.isfinite(tap)
-                tap = jnp.where(finite | (weight != 0), tap, 0)
-                weight = jnp.where(finite, weight, jax.lax.stop_gradient(weight))
-                total = weight * tap if total is None else total + weight * tap
-        assert total is not None
-        return total
+        columns = _taps_at(positions[..., 0], width, mode, boundary)
+        rows = _taps_at(positions[..., 1], height, mode, boundary)
+        return weigh_taps(image, columns, rows)
 
     return over_batch(one, image, positions_px)
 
@@ -141,10 +167,12 @@ def _resize_axis(image: Array, size: int, axis: int, mode: str) -> Array:
     if old == size:
         return image
     # Positions are known in advance: indices and weights are float64 constants.
-    first, fraction = _first_tap((np.arange(size) + 0.5) * (old / size) - 0.5, mode, np)
+    # One division, of whole numbers: exact halves stay exact.
+    base, fraction = _split((np.arange(size) * 2 + 1) * old / (2 * size) - 0.5, mode, np)
+    first = base.astype(np.int32) - (1 if mode == "bicubic" else 0)
     total = None
     for k, weight in enumerate(kernel_taps(fraction, mode, np)):
-        tap = jnp.take(image, np.clip(first.astype(np.int32) + k, 0, old - 1), axis=axis, mode="clip")
+        tap = jnp.take(image, np.clip(first + k, 0, old - 1), axis=axis, mode="clip")
         constant = jnp.asarray(weight.reshape(-1, *[1] * (-axis - 1)), image.dtype)
         constant = constant.reshape((1,) * (image.ndim - constant.ndim) + constant.shape)
         product = jnp.where(constant == 0, 0, constant * tap)
@@ -182,12 +210,13 @@ def _upsample_axis(image: Array, scale: int, axis: int, mode: str) -> Array:
     padded = jnp.concatenate([first_pixel] * pad + [image] + [last_pixel] * pad, axis=axis)
     phases = []
     for phase in range(scale):
-        first, fraction = _first_tap(np.float64((phase + 0.5) / scale - 0.5), mode, np)
+        base, fraction = _split(np.float64((phase + 0.5) / scale - 0.5), mode, np)
+        first = int(base) - (1 if mode == "bicubic" else 0)
         total = None
         for k, weight in enumerate(kernel_taps(fraction, mode, np)):
             if weight == 0:
                 continue
-            start = int(first) + k + pad
+            start = first + k + pad
             product = _slice(padded, axis, start, start + image.shape[axis]) * float(weight)
             total = product if total is None else total + product
         assert total is not None
@@ -226,9 +255,9 @@ def zero_upsample(image: Float[Array, "*b h w c"], scale: int) -> Float[Array, "
 
 @functools.partial(jax.jit, static_argnames=("block",))
 def space_to_depth(image: Float[Array, "*b h w c"], block: int) -> Float[Array, "*b h2 w2 c2"]:
-    """Each block of pixels becomes one pixel: `[H, W, C] -> [H / s, W / s, C s^2]`.
+    """Each block of pixels becomes one pixel: `[H, W, C] -> [H / b, W / b, C b^2]`, b = `block`.
 
-    Output channel `c s^2 + dy s + dx` is input channel c at (dy, dx) of the block, the order of PyTorch's
+    Output channel `c b^2 + dy b + dx` is input channel c at (dy, dx) of the block, the order of PyTorch's
     `pixel_unshuffle`. `depth_to_space` is the inverse.
 
     Raises:

@@ -4,9 +4,10 @@ All three follow the convention of `jaxsr.frames`: motion is backward and in pix
 that the point seen at p lies at `p - motion_px(p)` in the previous frame. Warping reads there; splatting
 writes there. Images are `[H, W, C]` or `[B, H, W, C]`; values have no range, results keep the dtype.
 
-Whole pixels and fractions are split on the motion itself, not on `p - motion_px`: a uniform motion then
-means the same thing at every pixel, also thousands of pixels from the origin. Motion of any size is fine;
-a NaN component of the motion counts as 0 (and gets no gradient), an infinite one points outside the image.
+Whole pixels and fractions are split on the motion itself, not on `p - motion_px` as `resampling.sample` does
+with positions: a uniform motion then means the same thing at every pixel, also thousands of pixels from the
+origin. Rounding is half to even on the motion, where `sample` rounds positions half up. Motion of any size is
+fine; a NaN component counts as 0 (and gets no gradient), an infinite one points outside the image.
 
 No guide, no hole filling: that is `jaxsr.ops.reprojection`.
 """
@@ -21,9 +22,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxsr.errors import JaxsrError
 from jaxsr.ops._batch import over_batch
-
-Mode = Literal["bilinear", "nearest", "bicubic"]
-Boundary = Literal["clamp", "zero"]
+from jaxsr.ops.resampling import axis_taps, check_mode, weigh_taps
 
 
 @functools.partial(jax.jit, static_argnames=("mode", "boundary"))
@@ -31,33 +30,28 @@ def backward_warp(
     image: Float[Array, "*b h w c"],
     motion_px: Float[Array, "*b h w 2"],
     *,
-    mode: Mode = "bilinear",
-    boundary: Boundary = "clamp",
+    mode: str = "bilinear",
+    boundary: str = "clamp",
 ) -> Float[Array, "*b h w c"]:
     """Read `image` where each pixel came from: `out(p) = image(p - motion_px(p))`.
 
-    `"bicubic"` is Keys' kernel with a = -0.5, that is Catmull-Rom: the history filter of temporal
-    anti-aliasing (Jimenez 2016); OpenCV and PyTorch use a = -0.75. It overshoots at edges. `"clamp"`
-    repeats the border pixels; under `"zero"` every tap outside the image contributes 0. An infinite
-    pixel makes NaN of its bilinear and bicubic neighbours: warp depth with `"nearest"`.
+    The filters are those of `resampling.sample`; "bicubic" is the history filter of temporal anti-aliasing
+    (Jimenez 2016) and overshoots at edges. A tap of zero weight adds nothing, so whole motion is an exact
+    shift of any values; at a fraction an infinite or NaN pixel reaches all that give it a weight (infinite or
+    NaN): warp depth with "nearest".
 
-    Differentiable in `image` and, unless the mode is `"nearest"` (half to even), in `motion_px`.
+    Differentiable in `image` and, unless the mode is "nearest", in `motion_px`.
 
     Args:
         image: the previous frame, any range.
         motion_px: backward motion (x, y) in pixels of `image`.
-        mode: interpolation.
-        boundary: what lies outside the image.
+        mode: "nearest" (halves of the motion round to even), "bilinear" or "bicubic".
+        boundary: taps outside the image repeat its border ("clamp") or are "zero".
 
     Raises:
         JaxsrError: unknown mode or boundary, or sizes that do not agree.
     """
-    if mode not in ("bilinear", "nearest", "bicubic"):
-        raise JaxsrError(
-            "unknown mode", where="backward_warp", expected="bilinear, nearest or bicubic", found=mode
-        )
-    if boundary not in ("clamp", "zero"):
-        raise JaxsrError("unknown boundary", where="backward_warp", expected="clamp or zero", found=boundary)
+    check_mode(mode, boundary)
     _check_sizes("backward_warp", image, motion_px)
     return over_batch(functools.partial(_warp, mode=mode, boundary=boundary), image, motion_px)
 
@@ -155,50 +149,16 @@ def _whole_and_fraction(
     return whole.astype(jnp.int32), offset - whole
 
 
-def _kernel(mode: Mode, f: Float[Array, "h w"]) -> dict[int, Float[Array, "h w"]]:
-    """Weights of the taps at whole offsets, for a sample at fraction f in [0, 1) past tap 0."""
-    if mode == "bilinear":
-        return {0: 1 - f, 1: f}
-    # Keys 1981, eq. (8), a = -1/2; Horner form.
-    return {
-        -1: ((-0.5 * f + 1.0) * f - 0.5) * f,
-        0: (1.5 * f - 2.5) * f * f + 1.0,
-        1: ((-1.5 * f + 2.0) * f + 0.5) * f,
-        2: (0.5 * f - 0.5) * f * f,
-    }
-
-
-def _warp(image: Array, motion: Array, *, mode: Mode, boundary: Boundary) -> Array:
-    h, w, c = image.shape
+def _warp(image: Array, motion: Array, *, mode: str, boundary: str) -> Array:
+    h, w, _ = image.shape
     if image.size == 0:
         return image
     rounding: Literal["floor", "round"] = "round" if mode == "nearest" else "floor"
     dx, fx = _whole_and_fraction(-motion[..., 0], w, rounding)
     dy, fy = _whole_and_fraction(-motion[..., 1], h, rounding)
-    x0, y0 = jnp.arange(w)[None, :] + dx, jnp.arange(h)[:, None] + dy
-
-    # Rows of channels are gathered whole: planar gathers are several times slower.
-    pixels = image.reshape(h * w, c)
-
-    def tap(ky: int, kx: int) -> Array:
-        x, y = x0 + kx, y0 + ky
-        index = jnp.clip(y, 0, h - 1) * w + jnp.clip(x, 0, w - 1)
-        value = pixels.at[index].get(mode="promise_in_bounds")
-        if boundary == "clamp":
-            return value
-        inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
-        return jnp.where(inside[..., None], value, 0)
-
-    if mode == "nearest":
-        return tap(0, 0)
-    # A half-precision image is summed in the precision of the motion.
-    dtype = max(image.dtype, fx.dtype, key=lambda d: d.itemsize)
-    fx, fy = fx.astype(dtype), fy.astype(dtype)
-    rows = []
-    for ky, wy in _kernel(mode, fy).items():
-        row = [wx[..., None] * tap(ky, kx).astype(dtype) for kx, wx in _kernel(mode, fx).items()]
-        rows.append(wy[..., None] * functools.reduce(jnp.add, row))
-    return functools.reduce(jnp.add, rows).astype(image.dtype)
+    columns = axis_taps(jnp.arange(w)[None, :] + dx, fx, w, mode, boundary)
+    rows = axis_taps(jnp.arange(h)[:, None] + dy, fy, h, mode, boundary)
+    return weigh_taps(image, columns, rows)
 
 
 def _origin(motion: Float[Array, "h w 2"]) -> Int[Array, " n"]:
