@@ -31,7 +31,9 @@ def test_frames_size_and_content(tmp_path):
         "red": [flat((t, 0, 0)) for t in (0.2, 0.6, 1.0)],
         "grey": [flat((0.5, 0.5, 0.5)) for _ in range(3)],
     }
-    path = write_video(tmp_path / "sub" / "v.mp4", columns, fps=8, scale=3)
+    steps = []
+    path = write_video(tmp_path / "sub" / "v.mp4", columns, fps=8, scale=3, advance=lambda: steps.append(1))
+    assert len(steps) == 3
     info, frames = read_back(path)
     assert info.startswith("h264")
     assert "yuv420p(tv, bt709" in info

@@ -8,8 +8,9 @@ import contextlib
 import math
 import subprocess
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import imageio_ffmpeg
 import matplotlib
@@ -84,6 +85,7 @@ def write_video(
     *,
     per_row: int | None = None,
     captions: Sequence[str] | None = None,
+    advance: Callable[[], Any] = lambda: None,
 ) -> Path:
     """Write labelled columns of frames as one .mp4 (H.264, yuv420p, BT.709), atomically.
 
@@ -94,6 +96,7 @@ def write_video(
         scale: every pixel is repeated so often in x and y; by default as often as 1920 pixels of width allow.
         per_row: images in a row; by default all.
         captions: one text a frame, shown beside the first label, for instance "frame 12, extrapolated".
+        advance: called after each frame, for a progress bar.
 
     Returns:
         The path.
@@ -135,7 +138,7 @@ def write_video(
         command = [
             *(imageio_ffmpeg.get_ffmpeg_exe(), "-hide_banner", "-loglevel", "error", "-y"),
             *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{first.shape[1]}x{first.shape[0]}"),
-            *("-r", f"{fps:g}", "-i", "-", "-an", "-c:v", "libx264", "-crf", "16", "-preset", "medium"),
+            *("-r", f"{fps:g}", "-i", "-", "-an", "-c:v", "libx264", "-crf", "16", "-preset", "veryfast"),
             *("-vf", "scale=out_color_matrix=bt709:out_range=tv", "-pix_fmt", "yuv420p"),
             *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"),
             *("-movflags", "+faststart", "-f", "mp4", str(temporary)),
@@ -144,8 +147,10 @@ def write_video(
         assert process.stdin is not None
         try:
             process.stdin.write(first.tobytes())
+            advance()
             for i in range(1, count):
                 process.stdin.write(sheet(i).tobytes())
+                advance()
             process.stdin.close()
         except BrokenPipeError:  # ffmpeg gave up; its status and its message say why
             with contextlib.suppress(BrokenPipeError):
