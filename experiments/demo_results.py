@@ -9,7 +9,7 @@ truth).
 
 import json
 import platform
-import subprocess
+import sys
 import tempfile
 import time
 from dataclasses import dataclass
@@ -29,6 +29,9 @@ from jaxsr.io.exr import atomic_path
 from jaxsr.io.images import write_png
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path.insert(0, str(ROOT))
+from experiments.provenance import commit  # noqa: E402
+
 RESULTS = ROOT / "experiments" / "results"
 IMAGES = ROOT / "docs" / "images"
 
@@ -168,11 +171,9 @@ def main(config: Config) -> None:
         for scale in config.scales:
             paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)
             sections += run_demo(Path(folder) / f"x{scale}", paths, scale=scale, progress=progress)
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], cwd=ROOT, capture_output=True, text=True, check=False
-    ).stdout.strip()
+    state = commit()
     meta = description(
-        commit=commit,
+        commit=state,
         processor=platform.processor() or platform.machine(),
         seconds=round(time.time() - start),
         seed="none: nothing is random",
@@ -184,7 +185,7 @@ def main(config: Config) -> None:
         document = as_json(sections, title="demo", meta=meta)
         temporary.write_text(json.dumps(document, indent=1) + "\n")
     lines = [
-        f"Measured by `experiments/demo_results.py` at {commit} on {meta['date']} ({meta['device']}, jax "
+        f"Measured by `experiments/demo_results.py` at {state} on {meta['date']} ({meta['device']}, jax "
         f"{meta['jax']}): mean ± standard deviation over frames. Display-referred colour, no crop.",
         "",
     ]
