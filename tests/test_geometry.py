@@ -118,13 +118,6 @@ def test_the_analytic_scene_agrees(jitter):
     np.testing.assert_allclose(ops.camera_motion(depth, now, before, j), layers["motion"], atol=1e-4)
 
 
-def test_scale_converts_the_jitter():
-    camera, j = _camera(np.random.default_rng(1)), jnp.asarray([0.25, -0.125])
-    np.testing.assert_allclose(
-        ops.view_directions(camera, (4, 6), j, scale=2), ops.view_directions(camera, (4, 6), 2 * j), atol=1e-6
-    )
-
-
 def test_a_still_camera_moves_nothing_and_translation_spares_the_sky():
     rng = np.random.default_rng(2)
     camera, depth = _camera(rng), _depth(rng, (5, 6)).at[0].set(jnp.inf)

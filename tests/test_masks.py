@@ -60,11 +60,14 @@ def test_depth_mask_is_the_loop(size, seed):
     np.testing.assert_array_equal(ops.depth_mask(depth, previous, motion, tolerance=0.05), expected)
 
 
-@given(size=st.sampled_from(SIZES), seed=st.integers(0, 10**6))
-def test_position_mask_is_the_loop(size, seed):
+@given(
+    size=st.sampled_from(SIZES), shift=st.sampled_from([(0.0, 0.0), (0.4, -0.25)]), seed=st.integers(0, 10**6)
+)
+def test_position_mask_is_the_loop(size, shift, seed):
     rng = np.random.default_rng(seed)
     depth, previous, motion = _depths(rng, size), _depths(rng, size), _motion(rng, size)
     normal, now, before = _normals(rng, size), _camera(3, size), _camera(2, size)
+    now, before = now._replace(lens_shift=_f32(shift)), before._replace(lens_shift=_f32(shift))
     jitter, jitter_before = _f32(rng.uniform(-0.5, 0.5, (2, 2)))
     result = ops.position_mask(depth, previous, normal, motion, now, before, jitter, jitter_before)
     pixel = 2 * np.max(np.asarray(now.tan_half_fov) / [size[1], size[0]])
@@ -135,6 +138,19 @@ def test_outside_the_previous_frame_is_a_hole(motion):
     depth, camera = jnp.full((*size, 1), 4.0), _camera(0, size)
     motion = jnp.zeros((*size, 2)).at[..., 0].set(motion)
     np.testing.assert_array_equal(ops.depth_mask(depth, depth, motion), 0)
+    np.testing.assert_array_equal(ops.position_mask(depth, depth, None, motion, camera, camera), 0)
+
+
+def test_a_change_of_lens_shift_is_a_shift_of_the_image():
+    # The same wall through a lens that moved by a whole number of pixels: `ndc = x / z - lens_shift`.
+    size, pixels = (8, 10), np.array([3, -2])
+    camera, depth = _camera(0, size), jnp.full((8, 10, 1), 4.0)
+    moved = camera._replace(lens_shift=_f32(2 * pixels / [10, 8]))
+    motion = jnp.broadcast_to(_f32(-pixels), (8, 10, 2))  # the current lens is `moved`: p_prev = p + pixels
+    valid = ops.position_mask(depth, depth, None, motion, moved, camera, tolerance=0.1)
+    x, y = np.moveaxis(np.asarray(ops.pixel_grid(*size)), -1, 0)
+    inside = (x + 3 <= 9) & (y - 2 >= 0)
+    np.testing.assert_array_equal(valid[..., 0], inside)
     np.testing.assert_array_equal(ops.position_mask(depth, depth, None, motion, camera, camera), 0)
 
 

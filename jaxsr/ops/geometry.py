@@ -68,9 +68,9 @@ def _check_size(where: str, size: tuple[int, int]) -> None:
         raise JaxsrError("bad size", where=where, expected="(H, W), at least 1 x 1", found=size)
 
 
-@functools.partial(jax.jit, static_argnames=("size", "scale"))
+@functools.partial(jax.jit, static_argnames=("size",))
 def view_directions(
-    camera: Camera, size: tuple[int, int], jitter_px: Float[Array, "*b 2"] | None = None, scale: float = 1
+    camera: Camera, size: tuple[int, int], jitter_px: Float[Array, "*b 2"] | None = None
 ) -> Float[Array, "*b h w 3"]:
     """World-space rays through the pixels, of unit view depth: `position = eye + depth * direction`.
 
@@ -79,8 +79,7 @@ def view_directions(
     Args:
         camera: of the frame.
         size: (H, W).
-        jitter_px: J in pixels of this image, divided by `scale`.
-        scale: how many times this image is larger than the one whose pixels `jitter_px` counts.
+        jitter_px: J in pixels of this image.
 
     Raises:
         JaxsrError: bad size.
@@ -88,7 +87,6 @@ def view_directions(
     _check_size("view_directions", size)
 
     def one(matrix: Array, camera: Camera, jitter: Array | None) -> Array:
-        jitter = None if jitter is None else jitter * scale
         return rotate(matrix[:3, :3], view_rays(looked_at(size, jitter), camera, size))
 
     return over_batch(one, jnp.asarray(camera.world_from_view), camera, jitter_px, ndim=2)

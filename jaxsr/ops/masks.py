@@ -2,8 +2,8 @@
 
 Masks are float32 `[..., H, W, 1]`, exactly 0 or 1, and carry no gradient. They are those of ExtraNet
 (Guo et al. 2021): a change of object, for moving objects a change of normal, for static ones the distance
-in world space to the nearest of the four bilinear taps; and a depth test for temporal upscalers that know
-no camera. Where the origin of a pixel lies outside the previous image it is a hole; sky matches sky alone.
+in world space to the nearest of the four bilinear taps; and a test of depth alone, where no camera is known.
+Where the origin of a pixel lies outside the previous image it is a hole; sky matches sky alone.
 
 Motion is backward, in pixels of its own image, between the two images as they are: for jittered G-buffers
 pass `jitter.jittered_motion`, except to `disocclusion_mask`, which takes the jitters and does it itself.
@@ -189,16 +189,10 @@ def position_mask(
         for x, y, counts in _taps(positions, height, width):
             tap = gather_pixels(previous, x, y)
             tap_hit = jnp.isfinite(tap)
-            distance = jnp.zeros(depth.shape)
-            for axis, pixel_index in enumerate((x, y)):
-                looked = pixel_index[..., None].astype(jnp.float32)
-                looked += 0.0 if jitter_before is None else jitter_before[axis]
-                ndc = (looked + 0.5) * (2 / size[1 - axis]) - 1
-                ray = (ndc + before.lens_shift[axis]) * before.tan_half_fov[axis]
-                offset = jnp.where(tap_hit, tap, 1.0) * ray - point[..., axis : axis + 1]
-                distance += offset * offset
-            offset = jnp.where(tap_hit, tap, 1.0) - point[..., 2:]
-            near = distance + offset * offset <= threshold * threshold
+            looked = jnp.stack([x, y], axis=-1).astype(jnp.float32)
+            looked = looked if jitter_before is None else looked + jitter_before[None, None]
+            offset = jnp.where(tap_hit, tap, 1.0) * view_rays(looked, before, size) - point
+            near = _dot(offset, offset) <= threshold * threshold
             valid |= counts & (tap_hit == hit) & (near | ~hit)
         return _as_mask(valid & _in_frame(positions, height, width))
 

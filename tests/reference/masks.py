@@ -1,4 +1,4 @@
-"""The masks one pixel at a time. A camera is (eye, rotation, tan_half_fov) and lens shift is left out."""
+"""The masks one pixel at a time. Cameras enter as the world positions and rays that `geometry` gives."""
 
 import numpy as np
 
