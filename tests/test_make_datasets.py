@@ -186,6 +186,11 @@ def test_archives_are_deterministic_and_checked(packed, tmp_path):
         archive.read_manifest(file)
 
 
+def description(**changes: object) -> dict:
+    head = {"format": "jaxsr-sequence", "version": 1, "size": [4, 2], "scales": [2], "frames": [{}]}
+    return head | changes
+
+
 def write_manifest(file: Path, manifest: object) -> Path:
     with zipfile.ZipFile(file, "w") as out:
         out.writestr("manifest.json", json.dumps(manifest))
@@ -198,7 +203,7 @@ def write_manifest(file: Path, manifest: object) -> Path:
 )
 def test_names_that_lead_out_of_the_folder_are_refused(tmp_path, name):
     head = {"format": archive.FORMAT, "version": archive.VERSION, "members": {}}
-    file = write_manifest(tmp_path / "a.jsrz", head | {"sequences": {name: {}}})
+    file = write_manifest(tmp_path / "a.jsrz", head | {"sequences": {name: description()}})
     with pytest.raises(JaxsrError, match="unsafe name of a sequence"):
         archive.read_manifest(file)
     assert md.main(["unpack", str(tmp_path / "out"), "--archive", str(file)]) == 2
@@ -212,9 +217,15 @@ def test_damaged_manifests_and_checksums(tmp_path):
         ({"format": "x"}, "another kind of archive"),
         (head, 'damaged manifest; expected "sequences"'),
         (head | {"sequences": []}, 'damaged manifest; expected "sequences"'),
+        (head | {"sequences": {"a": []}}, r"a\.jsrz, a: not a sequence"),
+        (head | {"sequences": {"a": description(size=[1])}}, r"a\.jsrz, a: bad size"),
     ]:
         with pytest.raises(JaxsrError, match=words):
             archive.read_manifest(write_manifest(tmp_path / "a.jsrz", manifest))
+    file = write_manifest(tmp_path / "a.jsrz", head | {"sequences": {"a": description(frames=[{}])}})
+    with pytest.raises(JaxsrError, match=r"a\.jsrz, a: entry 0 of frames is not right.*missing 'camera'"):
+        archive.unpack_sequence(file, archive.read_manifest(file), "a", tmp_path / "out")
+    assert not (tmp_path / "out").exists()
     (tmp_path / "a.jsrz.sha256").write_text("")
     with pytest.raises(JaxsrError, match="checksum does not match"):
         archive.verify(tmp_path / "a.jsrz")

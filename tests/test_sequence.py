@@ -202,6 +202,7 @@ def test_a_file_lost_or_cut_after_opening(seq):
         (lambda h: h["frames"].reverse(), "frame 2 follows frame 3"),
         (lambda h: h.update(fps="abc"), 'bad fps; expected a number above 0; found "abc"'),
         (lambda h: h.update(fps=0), "bad fps.*found 0"),
+        (lambda h: h["frames"][1].update(jitter_px=[10**400, 0]), "entry 1 of frames"),
         (lambda h: h.update(fps=float("inf")), "bad fps.*found Infinity"),
         (lambda h: h.update(exposure=None), "bad exposure; expected a number above 0; found null"),
         (lambda h: h.update(exposure=0.0), "bad exposure.*found 0.0"),

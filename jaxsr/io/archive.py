@@ -19,7 +19,7 @@ import numpy as np
 from jaxsr.errors import JaxsrError
 from jaxsr.io.archive_coding import decode_frame, encode_frame
 from jaxsr.io.exr import atomic_path, read_exr, remove_leftovers
-from jaxsr.io.sequence import Sequence
+from jaxsr.io.sequence import Sequence, check_head, frame_info
 from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter, frame_file
 
 FORMAT, VERSION = "jaxsr-archive", 1
@@ -123,7 +123,8 @@ def read_manifest(archive: Path) -> dict[str, Any]:
     for key in ("sequences", "members"):
         if not isinstance(manifest.get(key), dict):
             raise JaxsrError("damaged manifest", where=archive, expected=f'"{key}": {{...}}')
-    for name in manifest["sequences"]:
+    for name, head in manifest["sequences"].items():
+        check_head(head, f"{archive}, {name}")
         if not _stays_inside(name):
             raise JaxsrError(
                 "unsafe name of a sequence", where=archive, expected="a relative path", found=name
@@ -152,24 +153,18 @@ def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folde
     Raises:
         JaxsrError: a member is missing or damaged.
     """
-    head = dict(manifest["sequences"][name])
-    infos = []
-    for entry in head["frames"]:
-        camera = [
-            np.asarray(entry["camera"][key]) for key in ("world_from_view", "tan_half_fov", "lens_shift")
-        ]
-        jitter = (entry["jitter_px"][0], entry["jitter_px"][1])
-        infos.append(FrameInfo(entry["index"], jitter, entry["cut"], *camera))
+    head = manifest["sequences"][name]
+    infos = [frame_info(entry, k, f"{archive}, {name}") for k, entry in enumerate(head["frames"])]
     writer = SequenceWriter(
         folder,
-        name=head["name"],
+        name=head.get("name", Path(name).name),
         size=tuple(head["size"]),
         scales=head["scales"],
-        fps=head["fps"],
-        exposure=head["exposure"],
-        license=head["license"],
-        generator=head["generator"]
-        | {"quantised": f"{FORMAT} {VERSION}, {manifest['color_bits']} bits of colour"},
+        fps=head.get("fps", 24.0),
+        exposure=head.get("exposure", 1.0),
+        license=head.get("license", ""),
+        generator=head.get("generator", {})
+        | {"quantised": f"{FORMAT} {VERSION}, {manifest.get('color_bits')} bits of colour"},
         precision={"motion": "float"},
     )
     images: dict[int, dict[str, dict[str, np.ndarray]]] = {}

@@ -59,7 +59,7 @@ class Sequence:
         path = Path(path)
         path = path.parent if path.name == "sequence.json" else path
         head = _read_head(path)
-        infos = [_frame_info(entry, k, path) for k, entry in enumerate(head["frames"])]
+        infos = [frame_info(entry, k, path / "sequence.json") for k, entry in enumerate(head["frames"])]
         for a, b in itertools.pairwise(infos):
             if b.index <= a.index or (b.index != a.index + 1 and not b.cut):
                 raise JaxsrError(
@@ -287,6 +287,16 @@ def _read_head(path: Path) -> dict[str, Any]:
         raise JaxsrError(
             "bad JSON", where=file, found=e, fix="correct it, or write the sequence again"
         ) from e
+    check_head(head, file)
+    return head
+
+
+def check_head(head: Any, file: str | Path) -> None:
+    """See that a description, as read from JSON, is one: all but its frames (`frame_info`).
+
+    Raises:
+        JaxsrError: it is not, with `file` as the place.
+    """
     if not isinstance(head, dict) or head.get("format") != FORMAT:
         found = head.get("format") if isinstance(head, dict) else type(head).__name__
         raise JaxsrError("not a sequence", where=file, expected=f'"format": "{FORMAT}"', found=found)
@@ -309,7 +319,7 @@ def _read_head(path: Path) -> dict[str, Any]:
     for key in ("fps", "exposure"):
         value = head.get(key, 1.0)
         number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not (number and math.isfinite(value) and value > 0):
+        if not (number and 0 < value < math.inf):
             raise JaxsrError(f"bad {key}", where=file, expected="a number above 0", found=json.dumps(value))
     for key, kind, words in (
         ("name", str, "a text"),
@@ -320,10 +330,14 @@ def _read_head(path: Path) -> dict[str, Any]:
             raise JaxsrError(f"bad {key}", where=file, expected=words, found=json.dumps(head[key]))
     if not isinstance(head.get("frames"), list) or not head["frames"]:
         raise JaxsrError("no frames", where=file, expected='"frames": a list of at least one frame')
-    return head
 
 
-def _frame_info(entry: Any, k: int, path: Path) -> FrameInfo:
+def frame_info(entry: Any, k: int, where: str | Path) -> FrameInfo:
+    """Entry number `k` of "frames".
+
+    Raises:
+        JaxsrError: something is missing, not a number, or cannot be a camera; with `where` as the place.
+    """
     try:
         camera, index = entry["camera"], entry["index"]
         if not isinstance(index, int) or isinstance(index, bool) or index < 0:
@@ -339,11 +353,11 @@ def _frame_info(entry: Any, k: int, path: Path) -> FrameInfo:
     except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as e:
         raise JaxsrError(
             f"entry {k} of frames is not right",
-            where=path / "sequence.json",
+            where=where,
             expected="index, jitter_px, cut, camera (world_from_view, tan_half_fov, lens_shift)",
             found=f"missing {e}" if isinstance(e, KeyError) else e,
         ) from e
-    matrix, where = info.world_from_view, path / "sequence.json"
+    matrix = info.world_from_view
     numbers = [np.ravel(x) for x in (info.jitter_px, matrix, info.tan_half_fov, info.lens_shift)]
     if not np.isfinite(np.concatenate(numbers)).all():
         raise JaxsrError(f"frame {info.index}: camera or jitter is not finite", where=where)
