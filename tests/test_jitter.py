@@ -7,7 +7,9 @@ from hypothesis import strategies as st
 
 from jaxsr import ops
 from jaxsr.errors import JaxsrError
+from jaxsr.ops.resampling import MODES
 from tests.reference import jitter as reference
+from tests.reference import resampling
 from tests.transforms import assert_jit_and_batch
 
 SIZE = (10, 14)
@@ -90,17 +92,56 @@ def test_second_shader_fetches_the_same_values(scale):
 def test_printed_equation_8_is_wrong():
     pattern, now, before, p, expected = _setup(1)
     motion_j = pattern.motion(p) + before - now
-    right = pattern.image(p - motion_j + before - now, 0)
-    printed = pattern.image(p - now - motion_j + before - now, 0)
-    np.testing.assert_allclose(right, expected, atol=1e-12)
-    assert np.abs(printed - expected).max() > 0.1
+    args = (jnp.asarray(a, jnp.float32) for a in (motion_j, now, before))
+    ours = np.asarray(ops.positions_from_jittered_motion(*args).previous_output, np.float64)
+    printed = p - now - motion_j + before - now
+    np.testing.assert_allclose(ours - printed, np.broadcast_to(now, p.shape), atol=1e-5)
+    np.testing.assert_allclose(pattern.image(ours, 0), expected, atol=1e-5)
+    assert np.abs(pattern.image(printed, 0) - expected).max() > 0.1
 
 
-def test_the_motion_buffer_belongs_to_the_jittered_frame():
+@pytest.mark.parametrize("scale", [1, 2])
+def test_the_motion_buffer_belongs_to_the_jittered_frame(scale):
     # What a renderer writes at q is the motion of what it sees there, q + J: to be read at p - J.
-    pattern, now, _, p, _ = _setup(1)
-    np.testing.assert_allclose(pattern.motion((p - now) + now), pattern.motion(p))
-    assert np.abs(pattern.motion(p + now) - pattern.motion(p)).max() > 0.01
+    pattern, now, before, p, expected = _setup(scale)
+    y, x = np.mgrid[: SIZE[0], : SIZE[1]]
+    buffer = jnp.asarray(pattern.motion(np.stack([x, y], -1) + now), jnp.float32)
+    now32, before32 = jnp.asarray(now, jnp.float32), jnp.asarray(before, jnp.float32)
+
+    def errors(read_at):
+        motion = ops.sample(buffer, read_at, mode="bicubic")
+        positions = ops.positions_from_motion(motion, now32, before32, scale)
+        previous, output = (np.asarray(a, np.float64) for a in positions[1:])
+        fetched = pattern.jittered_image(previous, 0, before), pattern.image((output + 0.5) / scale - 0.5, 0)
+        inner = slice(3 * scale, -3 * scale)  # the buffer ends at its border
+        return [np.abs(values - expected)[inner, inner].max() for values in fetched]
+
+    right = errors(ops.current_positions(now32, p.shape[:2], scale))
+    wrong = errors(jnp.asarray(p, jnp.float32))
+    assert max(right) < 1e-3
+    assert min(wrong) > 10 * max(right)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_sample_jittered_is_the_loop(mode):
+    image = np.random.default_rng(0).standard_normal((5, 3, 2)).astype(np.float32)
+    jitter = np.array([0.375, -0.25], np.float32)
+    result = ops.sample_jittered(image, jitter, (10, 6), mode)
+    np.testing.assert_allclose(result, resampling.resize(image, (10, 6), mode, jitter), atol=2e-6)
+
+
+def test_sample_jittered_undoes_the_jitter_of_a_ramp():
+    # A linear image is reproduced by interpolation: x_lr of the unjittered image comes back.
+    jitter = np.array([0.3, -0.4], np.float32)
+    jittered = np.asarray(ops.pixel_grid(6, 7)) + jitter  # I_J(p) = I_N(p + J), I_N(p) = p
+    result = ops.sample_jittered(jittered, jitter, (12, 14), "bicubic")
+    expected = (np.asarray(ops.pixel_grid(12, 14)) + 0.5) / 2 - 0.5
+    np.testing.assert_allclose(result[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-5)
+
+
+def test_sample_jittered_wants_one_scale():
+    with pytest.raises(JaxsrError, match="same scale"):
+        ops.sample_jittered(jnp.zeros((5, 3, 2)), jnp.zeros(2), (10, 9))
 
 
 def test_jittered_motion_follows_the_jittered_image():
@@ -134,6 +175,7 @@ def test_jit_batch_and_gradients():
     assert_jit_and_batch(lambda *a: ops.positions_from_motion(*a, scale=2), *args)
     assert_jit_and_batch(lambda *a: ops.positions_from_jittered_motion(*a, scale=2), *args)
     assert_jit_and_batch(lambda j: ops.current_positions(j, (3, 4), 2), args[1])
+    assert_jit_and_batch(lambda x, j: ops.sample_jittered(x, j, (6, 8)), args[0], args[1])
     gradient = jax.grad(
         lambda m: ops.positions_from_motion(m, args[1][0], args[2][0], 2).previous_output.sum()
     )

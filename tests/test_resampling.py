@@ -76,22 +76,6 @@ def test_upsample_is_the_loop(size, scale, mode, seed):
     np.testing.assert_allclose(ops.upsample(image, scale, mode), expected, atol=2e-6)
 
 
-@pytest.mark.parametrize("mode", ["bilinear"])
-def test_sample_jittered_is_the_loop(mode):
-    image, jitter = _random(0, 5, 3, 2), np.array([0.375, -0.25], np.float32)
-    result = ops.sample_jittered(image, jitter, (10, 6), mode)
-    np.testing.assert_allclose(result, reference.resize(image, (10, 6), mode, jitter), atol=2e-6)
-
-
-def test_sample_jittered_undoes_the_jitter_of_a_ramp():
-    # A linear image is reproduced by interpolation: x_lr of the unjittered image comes back.
-    jitter = np.array([0.3, -0.4], np.float32)
-    jittered = np.asarray(ops.pixel_grid(6, 7)) + jitter  # I_J(p) = I_N(p + J), I_N(p) = p
-    result = ops.sample_jittered(jittered, jitter, (12, 14), "bicubic")
-    expected = (np.asarray(ops.pixel_grid(12, 14)) + 0.5) / 2 - 0.5
-    np.testing.assert_allclose(result[5:-5, 5:-5], expected[5:-5, 5:-5], atol=1e-5)
-
-
 @pytest.mark.parametrize("name", ["nearest_3x11", "nearest_10x14", "nearest_2x4", "bilinear_3x11"])
 @pytest.mark.parametrize("batch", [False, True])
 def test_resize_is_pytorch(name, batch):
@@ -221,7 +205,6 @@ def test_jit_and_batch():
     assert_jit_and_batch(lambda x: ops.resize(x, (5, 5)), image)
     assert_jit_and_batch(lambda x: ops.upsample(x, 2), image)
     assert_jit_and_batch(ops.sample, image, small)
-    assert_jit_and_batch(lambda x, j: ops.sample_jittered(x, j, (8, 12)), image, small[:, 0, 0])
 
 
 def test_upsample_traces_with_symbolic_sizes():

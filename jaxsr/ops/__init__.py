@@ -1,7 +1,9 @@
 """Pure functions on arrays: no files, no networks, no state.
 
-Each takes one image `[H, W, C]` or a batch `[B, H, W, C]`, is jitted, and is differentiable unless it says
-otherwise. `jaxsr.frames` states the conventions.
+What takes images takes one `[H, W, C]` or a batch `[B, H, W, C]`, is jitted, and is differentiable unless it
+says otherwise. Masks and motion are images in this sense; `halton` and `jitter_sequence` compute in NumPy on
+the host, and `pixel_grid` and `demodulation_divisor` are plain expressions. `jaxsr.frames` states the
+conventions.
 """
 
 from jaxsr.ops.color import (
@@ -25,6 +27,7 @@ from jaxsr.ops.jitter import (
     jittered_motion,
     positions_from_jittered_motion,
     positions_from_motion,
+    sample_jittered,
     unjittered_motion,
 )
 from jaxsr.ops.masks import (
@@ -41,7 +44,6 @@ from jaxsr.ops.resampling import (
     pixel_grid,
     resize,
     sample,
-    sample_jittered,
     space_to_depth,
     upsample,
     zero_upsample,

@@ -18,7 +18,8 @@ in it at p - J_t. The first shader reads it at p, which is exact only where neig
 the second reads it at p - J_t.
 
 All is in pixels of the image in question; jitter and motion in LR pixels unless said, J in [-0.5, 0.5].
-The positions are differentiable in motion and jitter. Nothing here reads an image: `resampling.sample` does.
+The positions are differentiable in motion and jitter. `resampling.sample` reads images there;
+`sample_jittered` does both for the current frame.
 """
 
 import functools
@@ -30,7 +31,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxsr.errors import JaxsrError
-from jaxsr.ops.resampling import pixel_grid
+from jaxsr.ops.resampling import pixel_grid, sample
 
 
 class SamplePositions(NamedTuple):
@@ -140,6 +141,39 @@ def current_positions(
     """
     shape = (*jitter_px.shape[:-1], *size, 2)
     return _output_pixels(shape, scale) - _at_pixels(jitter_px)
+
+
+@functools.partial(jax.jit, static_argnames=("size", "mode", "boundary"))
+def sample_jittered(
+    image: Float[Array, "*b h w c"],
+    jitter_px: Float[Array, "*b 2"],
+    size: tuple[int, int],
+    mode: str = "bilinear",
+    boundary: str = "clamp",
+) -> Float[Array, "*b h2 w2 c"]:
+    """The unjittered image at a larger (or equal) size, read from a jittered LR image at `current_positions`.
+
+    `I_N(p) = I_J(p - J)` (eq. 1).
+
+    Args:
+        image: the jittered LR image, any range.
+        jitter_px: J in pixels of `image`.
+        size: (H, W) of the result.
+        mode: as in `sample`.
+        boundary: as in `sample`.
+
+    Raises:
+        JaxsrError: a size of another shape than the image, or unknown mode or boundary.
+    """
+    height, width = image.shape[-3:-1]
+    if size[0] * width != size[1] * height:
+        raise JaxsrError(
+            "sizes do not match",
+            where="sample_jittered",
+            expected=f"the same scale along both axes of {height} x {width}",
+            found=f"{size[0]} x {size[1]}",
+        )
+    return sample(image, current_positions(jitter_px, size, size[0] / height), mode=mode, boundary=boundary)
 
 
 @functools.partial(jax.jit, static_argnames=("scale",))

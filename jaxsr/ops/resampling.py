@@ -298,34 +298,6 @@ def depth_to_space(image: Float[Array, "*b h w c"], block: int) -> Float[Array, 
     return blocks.reshape(*batch, height * block, width * block, channels // (block * block))
 
 
-@functools.partial(jax.jit, static_argnames=("size", "mode", "boundary"))
-def sample_jittered(
-    image: Float[Array, "*b h w c"],
-    jitter_px: Float[Array, "*b 2"],
-    size: tuple[int, int],
-    mode: str = "bilinear",
-    boundary: str = "clamp",
-) -> Float[Array, "*b h2 w2 c"]:
-    """The unjittered image at the pixels of a larger (or equal) one, read from a jittered LR image.
-
-    `I_N(p) = I_J(p - J)` (eq. 1), so the pixel x of the result reads `(x + 0.5) w / W - 0.5 - J_x`.
-
-    Args:
-        image: the jittered LR image.
-        jitter_px: J in pixels of `image`.
-        size: (H, W) of the result.
-        mode: as in `sample`.
-        boundary: as in `sample`.
-    """
-
-    def one(image: Array, jitter: Array) -> Array:
-        ratio = jnp.array([image.shape[1] / size[1], image.shape[0] / size[0]], jnp.float32)
-        positions = (pixel_grid(size[0], size[1]) + 0.5) * ratio[None, None] - 0.5
-        return sample(image, positions - jitter[None, None], mode=mode, boundary=boundary)
-
-    return over_batch(one, image, jitter_px)
-
-
 def _check_scale(scale: int) -> None:
     if scale < 1:
         raise JaxsrError("bad scale", where="scale", expected="a whole number of at least 1", found=scale)
