@@ -13,7 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxsr.io.sequence import FrameInfo, world_position
+from jaxsr.io.geometry import image_plane, to_pixels, world_position
+from jaxsr.io.writing import FrameInfo
 
 Layers = Mapping[str, np.ndarray]
 Size = tuple[int, int]
@@ -169,7 +170,7 @@ def static_motion(depth: np.ndarray, info: FrameInfo, info_previous: FrameInfo) 
     """`[h, w, 2]`: backward motion, in pixels, of points that stand still; 0 for sky."""
     h, w = depth.shape[:2]
     finite = np.where(is_sky(depth), np.inf, depth)
-    grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).astype(np.float64)
+    grid, _ = image_plane((w, h), info)
     back, _ = project(world_position(finite, info).astype(np.float64), info_previous, (w, h))
     return np.where(is_sky(depth), 0, grid - back)
 
@@ -179,8 +180,7 @@ def project(points: np.ndarray, info: FrameInfo, size: Size) -> tuple[np.ndarray
     matrix = np.asarray(info.world_from_view, np.float64)
     local = (points - matrix[:3, 3]) @ np.linalg.pinv(matrix[:3, :3]).T
     z = np.where(np.abs(local[..., 2:]) < 1e-9, 1e-9, local[..., 2:])
-    ndc = local[..., :2] / (z * np.asarray(info.tan_half_fov)) - np.asarray(info.lens_shift)
-    return (ndc + 1) / 2 * size - 0.5, local[..., 2]
+    return to_pixels(local[..., :2], z, info, size), local[..., 2]
 
 
 CAMERAS = {

@@ -25,8 +25,8 @@ from typing import Any
 
 import numpy as np
 
+from jaxsr.io.geometry import image_plane, to_pixels, world_position
 from jaxsr.io.images import linear_to_srgb, srgb_to_linear
-from jaxsr.io.sequence import world_position
 from jaxsr.io.writing import FrameInfo
 
 MOTION_STEP = 64.0
@@ -84,16 +84,14 @@ def camera_motion(
     depth: np.ndarray, info: FrameInfo, before: FrameInfo, jitter: tuple[float, float]
 ) -> np.ndarray:
     """Motion of a world that stands still, from depth `[h, w]`; the sky lies far away."""
-    h, w = depth.shape
+    size = depth.shape[1], depth.shape[0]
     near = np.where(np.isfinite(depth), depth, 1e7)[..., None]
     world = world_position(near, info, jitter).astype(np.float64)
     matrix = np.asarray(before.world_from_view, float)
     view = (world - matrix[:3, 3]) @ matrix[:3, :3]
-    z = np.maximum(view[..., 2:], 1e-3)
-    ndc = view[..., :2] / (z * np.asarray(before.tan_half_fov)) - np.asarray(before.lens_shift)
-    y, x = np.mgrid[0:h, 0:w]
-    p = np.stack([x + jitter[0], y + jitter[1]], -1)
-    return np.clip(p - ((ndc + 1) / 2 * (w, h) - 0.5), -4096, 4096)
+    p, _ = image_plane(size, info, jitter)
+    back = to_pixels(view[..., :2], np.maximum(view[..., 2:], 1e-3), before, size)
+    return np.clip(p - back, -4096, 4096)
 
 
 # --- lossless coding of integer planes -------------------------------------------------------------------

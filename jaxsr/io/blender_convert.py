@@ -12,6 +12,7 @@ from jaxtyping import Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera
+from jaxsr.io.geometry import image_plane, to_pixels
 from jaxsr.io.writing import HALF_MAX
 
 SKY_DEPTH = 1e9
@@ -34,11 +35,6 @@ def camera_from_json(entry: Mapping[str, Any]) -> Camera:
     return Camera(*(np.asarray(entry[name], np.float64) for name in Camera._fields))  # type: ignore[arg-type]
 
 
-def _grid(h: int, w: int, jitter_px: tuple[float, float]) -> Float[np.ndarray, "h w 2"]:
-    y, x = np.mgrid[0:h, 0:w].astype(np.float64)
-    return np.stack([x + jitter_px[0], y + jitter_px[1]], -1)
-
-
 def sky_motion(
     camera: Camera, previous: Camera, size: tuple[int, int], jitter_px: tuple[float, float] = (0.0, 0.0)
 ) -> Float[np.ndarray, "h w 2"]:
@@ -53,18 +49,13 @@ def sky_motion(
     Returns:
         `motion_px` in pixels of this image. Zero where the direction lay behind the previous camera.
     """
-    w, h = size
-    p = _grid(h, w, jitter_px)
-    ndc = (p + 0.5) / (w, h) * 2 - 1
-    xy = (ndc + np.asarray(camera.lens_shift)) * np.asarray(camera.tan_half_fov)
-    direction = np.concatenate([xy, np.ones((h, w, 1))], -1)
+    p, xy = image_plane(size, camera, jitter_px)
+    direction = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], -1)
     rotation = np.asarray(previous.world_from_view)[:3, :3].T @ np.asarray(camera.world_from_view)[:3, :3]
     before = direction @ rotation.T
     ahead = before[..., 2:] > 1e-6
     z = np.where(ahead, before[..., 2:], 1.0)
-    ndc_before = before[..., :2] / (z * np.asarray(previous.tan_half_fov)) - np.asarray(previous.lens_shift)
-    p_before = (ndc_before + 1) / 2 * (w, h) - 0.5
-    return np.where(ahead, p - p_before, 0.0)
+    return np.where(ahead, p - to_pixels(before[..., :2], z, previous, size), 0.0)
 
 
 def convert_color(raw: Mapping[str, np.ndarray]) -> Float[np.ndarray, "h w 3"]:

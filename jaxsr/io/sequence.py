@@ -20,6 +20,7 @@ from jaxtyping import Float
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, GBuffer
 from jaxsr.io.exr import read_exr, read_exr_header
+from jaxsr.io.geometry import world_position
 from jaxsr.io.writing import FORMAT, LAYERS, VERSION, FrameInfo, SequenceWriter, frame_file
 
 __all__ = ["FrameInfo", "Sequence", "SequenceWriter", "prefetch"]
@@ -204,21 +205,6 @@ class Sequence:
             if self.check:
                 _check_finite(layer, x, index, path)
         return layers
-
-
-def world_position(
-    depth_linear: Float[np.ndarray, "h w 1"], info: FrameInfo, jitter_px: tuple[float, float] = (0.0, 0.0)
-) -> Float[np.ndarray, "h w 3"]:
-    """World position of what each pixel sees, from linear depth (frames.Camera inverted); 0 for sky."""
-    h, w = depth_linear.shape[:2]
-    y, x = np.mgrid[0:h, 0:w].astype(np.float64)
-    p = np.stack([x + jitter_px[0], y + jitter_px[1]], -1)
-    ndc = (p + 0.5) / (w, h) * 2 - 1
-    z = np.where(np.isfinite(depth_linear), depth_linear, 0).astype(np.float64)
-    xy = (ndc + np.asarray(info.lens_shift)) * np.asarray(info.tan_half_fov) * z
-    matrix = np.asarray(info.world_from_view, np.float64)
-    world = np.concatenate([xy, z], -1) @ matrix[:3, :3].T + matrix[:3, 3]
-    return np.where(np.isfinite(depth_linear), world, 0).astype(np.float32)
 
 
 def prefetch(items: Iterable[T], depth: int = 2) -> Iterator[T]:
