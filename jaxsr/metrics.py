@@ -1,8 +1,10 @@
 """Image quality on display-referred images: PSNR, SSIM, FLIP, and the PSNR of frame differences.
 
-All take images `[H, W, 3]` in [0, 1], sRGB-encoded after the tone map (`jaxsr.ops.color.to_display`), and
-return a Python float. No metric crops, converts to luma, or quantises. Values outside [0, 1], NaN and
-unequal shapes are errors, never a number. They measure one pair of images on the host and are no losses.
+All take images `[H, W, 3]` in [0, 1], sRGB-encoded after the tone map (`jaxsr.ops.color.to_display`). `psnr`,
+`ssim` and `flip` return a Python float, `flip_map` an array `[H, W]`; `temporal_psnr` and `measure` take
+frames in order and return lists of one float or None a frame. No metric crops, converts to luma, or
+quantises. Values outside [0, 1], NaN and unequal shapes are errors, never a number. They compute on the host
+and are no losses.
 
 A mask `[H, W]` (True: counts) restricts the average to its pixels; nothing is cut out before filtering, so
 SSIM and FLIP there still see the neighbours of masked pixels. An empty mask is an error.
@@ -171,7 +173,11 @@ def ssim(image: Image, truth: Image, mask: Mask | None = None) -> float:
 
 
 def flip_map(image: Image, truth: Image, ppd: float = FLIP_PPD) -> Float[np.ndarray, "h w"]:
-    """LDR-FLIP error map (Andersson et al. 2020) in [0, 1], at `ppd` pixels per degree; by flip-evaluator."""
+    """LDR-FLIP error map (Andersson et al. 2020) in [0, 1], at `ppd` pixels per degree; by flip-evaluator.
+
+    Raises:
+        JaxsrError: as for `psnr`, and `ppd` not positive.
+    """
     image_, truth_ = _checked(image, truth)
     if not (math.isfinite(ppd) and ppd > 0.0):
         raise JaxsrError("pixels per degree must be positive", where="ppd", found=ppd)
@@ -184,7 +190,11 @@ def flip_map(image: Image, truth: Image, ppd: float = FLIP_PPD) -> Float[np.ndar
 
 
 def flip(image: Image, truth: Image, mask: Mask | None = None, ppd: float = FLIP_PPD) -> float:
-    """Mean of `flip_map`: 0 for identical images, at most 1. Lower is better."""
+    """Mean of `flip_map`: 0 for identical images, at most 1. Lower is better.
+
+    Raises:
+        JaxsrError: as for `flip_map`, and an empty mask.
+    """
     error = flip_map(image, truth, ppd)
     if mask is not None:
         error = error[_checked_mask(mask, error.shape)]

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from jaxsr.data import analytic
+from jaxsr.errors import JaxsrError
 
 SIZE = (48, 27)
 
@@ -63,3 +64,9 @@ def test_frame_hides_the_colour_of_unrendered_frames():
     assert not hidden.color_linear.any()
     assert truth.any()
     assert hidden.scale == 3
+
+
+@pytest.mark.parametrize(("size", "scale"), [((48, 26), 3), ((47, 27), 3), ((48, 27), 0)])
+def test_frame_wants_whole_multiples(size, scale):
+    with pytest.raises(JaxsrError, match="multiples of"):
+        analytic.frame(0, size, scale, (0.0, 0.0))

@@ -3,7 +3,8 @@
 Ray cast in NumPy float64, one sample a pixel, so every buffer is exact: depth, motion, normals, object ids
 and whether a point was visible one frame before. The camera turns and travels, a sphere rolls, a panel slides
 and a thin pole stands in front. Buffers obey `jaxsr.frames`; layer names are those of sequences on disk.
-Not a renderer: no anti-aliasing, no indirect light, and time is counted in frames.
+Not a renderer: no anti-aliasing, no indirect light. Time is counted in frames, lengths in units of the world
+(z is up); unlike elsewhere in jaxsr sizes are (width, height).
 """
 
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, Frame, GBuffer
 
 _SUN = np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])
@@ -27,6 +29,7 @@ class Material:
     metallic: float = 0.0
 
     def base_color(self, uv: np.ndarray) -> np.ndarray:
+        """Base colour `[..., 3]`, linear in [0, 1], at surface coordinates `[..., 2]`."""
         wave = np.sin(uv[..., 0] * self.frequency) * np.sin(uv[..., 1] * self.frequency)
         mix = (0.5 + 0.5 * np.tanh(4.0 * wave))[..., None]
         return (1.0 - mix) * np.array(self.dark) + mix * np.array(self.light)
@@ -34,6 +37,11 @@ class Material:
 
 @dataclass(frozen=True)
 class Sphere:
+    """A textured ball that moves evenly, in units a frame, and spins about its vertical axis.
+
+    "Local" points are those at time 0: a point of the surface keeps its local position for ever.
+    """
+
     center: tuple[float, float, float]
     radius: float
     velocity: tuple[float, float, float]
@@ -42,6 +50,10 @@ class Sphere:
     material: Material
 
     def intersect(self, origin: np.ndarray, rays: np.ndarray, time: float) -> np.ndarray:
+        """Distance `[...]`, in lengths of the ray, to the near side along `[..., 3]` rays; inf if missed.
+
+        `origin` is `[3]` or `[..., 3]`. A ray that starts inside misses.
+        """
         offset = origin - (np.array(self.center) + time * np.array(self.velocity))
         a = np.sum(rays * rays, -1)
         b = np.sum(rays * offset, -1)
@@ -52,17 +64,21 @@ class Sphere:
         return np.where((root > 0) & (near > 1e-6), near, np.inf)
 
     def to_local(self, points: np.ndarray, time: float) -> np.ndarray:
+        """World points `[..., 3]` at `time` in the frame of the ball, its centre at 0."""
         centered = points - (np.array(self.center) + time * np.array(self.velocity))
         return centered @ _rotation_z(self.spin * time)  # the transpose turns back
 
     def to_world(self, points: np.ndarray, time: float) -> np.ndarray:
+        """The inverse of `to_local`."""
         turned = points @ _rotation_z(self.spin * time).T
         return turned + np.array(self.center) + time * np.array(self.velocity)
 
     def normal(self, points: np.ndarray, rays: np.ndarray, time: float) -> np.ndarray:
+        """Outward unit normals `[..., 3]` at world points; `rays` do not matter."""
         return (points - (np.array(self.center) + time * np.array(self.velocity))) / self.radius
 
     def uv(self, local: np.ndarray) -> np.ndarray:
+        """Longitude and latitude `[..., 2]` of local points, in radians."""
         u = np.arctan2(local[..., 1], local[..., 0])
         v = np.arcsin(np.clip(local[..., 2] / self.radius, -1.0, 1.0))
         return np.stack([u, v], -1)
@@ -70,6 +86,11 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Quad:
+    """A textured rectangle, seen from both sides, that moves evenly, in units a frame.
+
+    The edges are at right angles and start at `origin`. "Local" points are world points at time 0.
+    """
+
     origin: tuple[float, float, float]
     edge_u: tuple[float, float, float]
     edge_v: tuple[float, float, float]
@@ -77,11 +98,13 @@ class Quad:
     material: Material
 
     def _frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Both edges and the unit normal, `[3]` each."""
         u, v = np.array(self.edge_u), np.array(self.edge_v)
         n = np.cross(u, v)
         return u, v, n / np.linalg.norm(n)
 
     def intersect(self, origin: np.ndarray, rays: np.ndarray, time: float) -> np.ndarray:
+        """Distance `[...]`, in lengths of the ray, along `[..., 3]` rays; inf if missed."""
         u, v, n = self._frame()
         start = np.array(self.origin) + time * np.array(self.velocity)
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -93,16 +116,20 @@ class Quad:
         return np.where(inside, t, np.inf)
 
     def to_local(self, points: np.ndarray, time: float) -> np.ndarray:
+        """World points `[..., 3]` at `time`, moved back to time 0."""
         return points - time * np.array(self.velocity)
 
     def to_world(self, points: np.ndarray, time: float) -> np.ndarray:
+        """The inverse of `to_local`."""
         return points + time * np.array(self.velocity)
 
     def normal(self, points: np.ndarray, rays: np.ndarray, time: float) -> np.ndarray:
+        """Unit normals `[..., 3]` at world points, on the side from which the `[..., 3]` rays come."""
         n = np.broadcast_to(self._frame()[2], points.shape)
         return np.where(np.sum(n * rays, -1, keepdims=True) > 0, -n, n)
 
     def uv(self, local: np.ndarray) -> np.ndarray:
+        """Distances `[..., 2]` of local points along the edges, from the origin."""
         u, v, _ = self._frame()
         offset = local - np.array(self.origin)
         return np.stack([offset @ (u / np.linalg.norm(u)), offset @ (v / np.linalg.norm(v))], -1)
@@ -232,8 +259,25 @@ def frame(
     """One `Frame` of HR `size` with its truth `[H, W, 3]`; an unrendered frame has no colour.
 
     Args:
+        time: the number of the frame; 0 is a cut.
+        size: (width, height) of the HR image, whole multiples of `scale`.
+        scale: HR size divided by LR size.
         jitter_px: J in LR pixels.
+        rendered: False leaves the LR colour zero.
+
+    Returns:
+        The frame, unbatched, its arrays NumPy float32, and the HR colour, linear and unjittered.
+
+    Raises:
+        JaxsrError: `size` is no whole multiple of `scale`.
     """
+    if scale < 1 or size[0] % scale or size[1] % scale:
+        raise JaxsrError(
+            "size is no multiple of scale",
+            where="analytic.frame",
+            expected=f"multiples of {scale}",
+            found=f"{size[0]} x {size[1]}",
+        )
     hr = render(time, size)
     lr = render(time, (size[0] // scale, size[1] // scale), jitter_px=jitter_px)
     view = Camera(*(value.astype(np.float32) for value in camera(time, size)))
@@ -258,6 +302,7 @@ def _rotation_z(angle: float) -> np.ndarray:
 
 
 def _rays(view: Camera, x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Eye `[3]` and world-space rays `[..., 3]` of unit view depth through pixels x, y `[...]`."""
     ndc = np.stack([(x + 0.5) / size[0], (y + 0.5) / size[1]], -1) * 2 - 1
     xy = (ndc + view.lens_shift) * view.tan_half_fov
     rays = np.concatenate([xy, np.ones_like(xy[..., :1])], -1) @ np.asarray(view.world_from_view)[:3, :3].T
@@ -265,6 +310,7 @@ def _rays(view: Camera, x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> 
 
 
 def _project(view: Camera, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels `[..., 2]` and view depth `[...]` of world points `[..., 3]`."""
     matrix = np.asarray(view.world_from_view)
     local = (points - matrix[:3, 3]) @ matrix[:3, :3]
     ndc = local[..., :2] / (local[..., 2:] * view.tan_half_fov) - view.lens_shift
@@ -274,14 +320,29 @@ def _project(view: Camera, points: np.ndarray, size: tuple[int, int]) -> tuple[n
 def _nearest(
     objects: tuple[Sphere | Quad, ...], origin: np.ndarray, rays: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray]:
+    """Distance `[...]` to the nearest object in lengths of the ray, and its index; inf and -1 for sky."""
     distances = np.stack([item.intersect(origin, rays, time) for item in objects])
     index = np.argmin(distances, 0)
     distance = np.min(distances, 0)
     return distance, np.where(np.isfinite(distance), index, -1)
 
 
-def _shade(objects, points, rays, normal, base, roughness, metallic, hit, time):
-    """Sun with hard shadows, a sky-coloured ambient term and a Blinn highlight; a gradient sky."""
+def _shade(
+    objects: tuple[Sphere | Quad, ...],
+    points: np.ndarray,
+    rays: np.ndarray,
+    normal: np.ndarray,
+    base: np.ndarray,
+    roughness: np.ndarray,
+    metallic: np.ndarray,
+    hit: np.ndarray,
+    time: float,
+) -> np.ndarray:
+    """Linear colour `[H, W, 3]`: sun with hard shadows, ambient sky, a Blinn highlight; a gradient sky.
+
+    `points`, `rays`, `normal` and `base` are `[H, W, 3]`, `roughness` and `metallic` `[H, W, 1]`, `hit` is
+    `[H, W]`.
+    """
     lifted = points + 1e-4 * normal
     distance, _ = _nearest(objects, lifted, np.broadcast_to(_SUN, points.shape), time)
     lit = (~np.isfinite(distance))[..., None]
