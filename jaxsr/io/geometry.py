@@ -3,12 +3,13 @@
 For files and checks. The methods use `jaxsr.ops.geometry`, which is JAX, differentiable and float32.
 """
 
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 
+@runtime_checkable
 class Pinhole(Protocol):
     """What `frames.Camera` and `writing.FrameInfo` share."""
 
