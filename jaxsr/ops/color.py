@@ -92,7 +92,7 @@ def srgb_from_linear(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
 
 @jax.jit
 def linear_from_srgb(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """The inverse of `srgb_from_linear`."""
+    """The inverse of `srgb_from_linear`, likewise exact and not clipped above 1."""
     x = _floor(srgb)
     curved = ((_floor(x, 0.04045) + 0.055) / 1.055) ** 2.4
     return jnp.where(x <= 0.04045, x / 12.92, curved)
@@ -114,9 +114,9 @@ def from_display(display: Float[Array, "*n"], exposure: float | Float[Array, ""]
 
 @jax.jit
 def ycocg_from_rgb(rgb: Float[Array, "*n 3"]) -> Float[Array, "*n 3"]:
-    """Luma Y and the chroma differences Co (orange), Cg (green): linear, invertible, any range.
+    """Luma Y and chroma differences Co (orange), Cg (green), of any range (Malvar and Sullivan 2003).
 
-    `Y = (R + 2 G + B) / 4, Co = (R - B) / 2, Cg = (2 G - R - B) / 4`.
+    Linear and invertible: `Y = (R + 2 G + B) / 4, Co = (R - B) / 2, Cg = (2 G - R - B) / 4`.
     """
     r, g, b = rgb[..., 0], rgb[..., 1], rgb[..., 2]
     return jnp.stack([0.25 * (r + b) + 0.5 * g, 0.5 * (r - b), 0.5 * g - 0.25 * (r + b)], axis=-1)

@@ -46,7 +46,7 @@ class SamplePositions(NamedTuple):
 
 
 def halton(index: int | Int[np.ndarray, "*n"], base: int) -> Float[np.ndarray, "*n"]:
-    """The radical inverse of `index` in `base`, in [0, 1). NumPy float64; computed on the host.
+    """The radical inverse of `index` in `base` (Halton 1960), in [0, 1). NumPy float64; computed on the host.
 
     Raises:
         JaxsrError: a negative index, or a base below 2.
@@ -65,7 +65,7 @@ def halton(index: int | Int[np.ndarray, "*n"], base: int) -> Float[np.ndarray, "
 
 
 def jitter_sequence(count: int, length: int = 32) -> Float[np.ndarray, "count 2"]:
-    """Jitter (x, y) of `count` frames: Halton(2, 3) from index 1 on, less one half, repeating.
+    """Jitter (x, y) of `count` frames: Halton(2, 3) from index 1 on, less one half, repeating (Karis 2014).
 
     Args:
         count: number of frames.
@@ -113,7 +113,7 @@ def unjittered_motion(
     jitter_px: Float[Array, "*b 2"],
     previous_jitter_px: Float[Array, "*b 2"],
 ) -> Float[Array, "*b h w 2"]:
-    """The inverse of `jittered_motion`: `MV_N = MV_J - J_{t-1} + J_t` (eq. 6)."""
+    """The inverse of `jittered_motion`: `MV_N = MV_J - J_{t-1} + J_t` (eq. 6); all in its image's pixels."""
     return motion_jittered_px - _at_pixels(previous_jitter_px - jitter_px)
 
 

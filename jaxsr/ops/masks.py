@@ -73,7 +73,7 @@ def _taps(positions: Array, height: int, width: int) -> list[tuple[Array, Array,
 def stencil_mask(
     object_id: Float[Array, "*b h w 1"], warped_previous_object_id: Float[Array, "*b h w 1"]
 ) -> Float[Array, "*b h w 1"]:
-    """Valid where the object is the same as where the pixel came from.
+    """Valid where the object is the same as where the pixel came from (ExtraNet's stencil test).
 
     Args:
         object_id: whole numbers, 0 for sky.
@@ -88,7 +88,12 @@ def normal_mask(
 ) -> Float[Array, "*b h w 1"]:
     """Valid where the cosine between the normals is at least `threshold` (0.98 is 11.5 degrees).
 
-    Lengths do not matter. Two missing normals (sky) agree; one missing normal does not.
+    Lengths do not matter. Two missing normals (sky) agree; one missing normal does not. 0.98 is ExtraNet's.
+
+    Args:
+        normal: world space, of the current frame, 0 for sky.
+        warped_normal: those of the previous frame, warped, likewise.
+        threshold: smallest cosine.
     """
     return _as_mask(_cosine(normal, warped_normal) >= threshold)
 
@@ -108,8 +113,8 @@ def depth_mask(
 
     Args:
         depth_linear: of the current frame, +inf for sky.
-        previous_depth_linear: of the previous one.
-        motion_px: backward motion between the two.
+        previous_depth_linear: of the previous one, in the same unit.
+        motion_px: backward motion between the two images as they are, jitter included.
         tolerance: largest relative difference.
     """
 
@@ -287,7 +292,7 @@ def blend_mask(
     delta_similar: float = 0.1,
     delta_different: float = 0.1,
 ) -> Float[Array, "*b h w 1"]:
-    """ExtraSS' choice between FRNet's low-resolution image (1) and the guided warp (0).
+    """ExtraSS' choice (Wu et al. 2023) between FRNet's low-resolution image (1) and the guided warp (0).
 
         m = [(1 - |U(a-) - a| / sqrt 3) <U(n-), n> > d1]  and  [|U(i-) - i^| / |U(i-)| > d2]
 

@@ -57,7 +57,7 @@ def kernel_taps(fraction, mode: str, xnp=jnp) -> list:
         return [xnp.ones_like(f)]
     if mode == "bilinear":
         return [1 - f, f]
-    return [  # Keys 1981, eq. 4 with a = -1/2
+    return [  # Keys 1981, with a = -1/2
         ((-0.5 * f + 1) * f - 0.5) * f,
         (1.5 * f - 2.5) * f * f + 1,
         ((-1.5 * f + 2) * f + 0.5) * f,
@@ -157,7 +157,7 @@ def sample(
 
 
 def pixel_grid(height: int, width: int) -> Float[Array, "h w 2"]:
-    """The position (x, y) of every pixel."""
+    """The position (x, y) of every pixel, in pixels, float32: (0, 0) is the centre of the top left one."""
     y, x = jnp.mgrid[:height, :width]
     return jnp.stack([x, y], axis=-1).astype(jnp.float32)
 
@@ -245,7 +245,11 @@ def upsample(
 
 @functools.partial(jax.jit, static_argnames=("scale",))
 def zero_upsample(image: Float[Array, "*b h w c"], scale: int) -> Float[Array, "*b h2 w2 c"]:
-    """`O[y, x] = I[y / s, x / s]` where s divides both, else 0: each sample sits top left in its block."""
+    """`O[y, x] = I[y / s, x / s]` where s divides both, else 0: each sample sits top left in its block.
+
+    Raises:
+        JaxsrError: a scale below 1.
+    """
     _check_scale(scale)
     *batch, height, width, channels = image.shape
     spread = jnp.zeros((*batch, height, scale, width, scale, channels), image.dtype)
@@ -279,7 +283,7 @@ def space_to_depth(image: Float[Array, "*b h w c"], block: int) -> Float[Array, 
 
 @functools.partial(jax.jit, static_argnames=("block",))
 def depth_to_space(image: Float[Array, "*b h w c"], block: int) -> Float[Array, "*b h2 w2 c2"]:
-    """The inverse of `space_to_depth`: PyTorch's `pixel_shuffle` on channels-last images.
+    """The inverse of `space_to_depth`, `[H, W, C b^2] -> [H b, W b, C]`: PyTorch's `pixel_shuffle`.
 
     Raises:
         JaxsrError: the channels are no multiple of `block` squared.

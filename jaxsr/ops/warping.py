@@ -62,7 +62,7 @@ def forward_splat(
     motion_px: Float[Array, "*b h w 2"],
     depth_linear: Float[Array, "*b h w 1"],
 ) -> tuple[Float[Array, "*b h w c"], Bool[Array, "*b h w 1"]]:
-    """Write each pixel's value where it came from; the nearest one wins.
+    """Write each pixel's value where it came from; the nearest one wins (the splat of Guo et al. 2021).
 
     Pixel q lands whole on `q - round(motion_px(q))`. Among those that land on one pixel the smallest
     depth wins, and among equal depths the first in row order: the result is deterministic. What lands
