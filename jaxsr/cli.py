@@ -112,7 +112,7 @@ def compare(
 @app.command
 def upscale(
     sequence: Positional[Path],
-    method: str = "guided",
+    method: str = "guided-taau",
     scale: int = 0,
     every: int = 1,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("jaxsr-upscaled"),

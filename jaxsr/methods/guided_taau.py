@@ -25,11 +25,13 @@ from jaxsr.ops import demodulate, modulate
 
 @dataclass(frozen=True)
 class Options:
-    """Constants, measured by `experiments/tune_classical.py`."""
+    """Constants, within 0.05 dB of the best that `experiments/tune_classical.py` finds."""
 
-    sigma_guide: float = 0.15
+    sigma_guide: float = 0.3
     """Standard deviation of the difference of base colour and normal between an HR pixel and an LR sample."""
-    temporal: taau.Options = taau.Options(kernel_sigma=0.5, sample_sigma=0.5)  # noqa: RUF009 (frozen)
+    temporal: taau.Options = taau.Options(  # noqa: RUF009 (frozen)
+        kernel_sigma=0.5, sample_sigma=0.7, memory=2.0, box=1.0
+    )
 
 
 def same_surface(gbuffer: GBuffer, sigma_guide: float) -> taau.Alike:

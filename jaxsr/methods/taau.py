@@ -41,15 +41,15 @@ from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid
 
 @dataclass(frozen=True)
 class Options:
-    """Constants of TAAU; the defaults are measured by `experiments/tune_classical.py`."""
+    """Constants of TAAU, within 0.05 dB of the best that `experiments/tune_classical.py` finds."""
 
     kernel_sigma: float = 0.35
     """Reconstruction kernel, in LR pixels."""
-    sample_sigma: float = 0.35
+    sample_sigma: float = 0.4
     """How near to a pixel a sample must fall to count in full, in HR pixels."""
     floor: float = 0.02
     """Least weight of the current frame: a history is never final."""
-    memory: float = 8.0
+    memory: float = 4.0
     """Greatest weight of the history."""
     box: float = 1.25
     """Half-width of the clipping box, in units of the neighbourhood's."""
