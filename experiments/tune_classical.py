@@ -12,7 +12,7 @@ of the sequences alike, all frames but the first two. The three frames of the sa
 few for that: a history takes longer to form.
 
 Test frames are not touched. Writes experiments/results/tune_<what>.json, .md and a figure. The defaults of
-`jaxsr.ops.reproject` are the optimum, those in `jaxsr.methods` lie within 0.05 dB of it: a longer memory than
+`jaxsr.ops.reproject` are the optimum, those in `jaxsr.methods` lie within 0.15 dB of it: a longer memory than
 the best PSNR asks for keeps still images steadier.
 """
 

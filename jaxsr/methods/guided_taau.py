@@ -25,7 +25,7 @@ from jaxsr.ops import demodulate, modulate
 
 @dataclass(frozen=True)
 class Options:
-    """Constants, within 0.05 dB of the best that `experiments/tune_classical.py` finds."""
+    """Constants, within 0.15 dB of the best that `experiments/tune_classical.py` finds."""
 
     sigma_guide: float = 0.3
     """Standard deviation of the difference of base colour and normal between an HR pixel and an LR sample."""

@@ -41,7 +41,7 @@ from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid
 
 @dataclass(frozen=True)
 class Options:
-    """Constants of TAAU, within 0.05 dB of the best that `experiments/tune_classical.py` finds."""
+    """Constants of TAAU, within 0.15 dB of the best that `experiments/tune_classical.py` finds."""
 
     kernel_sigma: float = 0.35
     """Reconstruction kernel, in LR pixels."""
