@@ -54,7 +54,8 @@ which both renders share, is not in it. Differences between methods near or abov
 
 ## Limits
 
-- Synthetic, three scenes; no characters, no volumes, no transparency or refraction, constant focal length.
+- Synthetic, three scenes; no characters, no transparency or refraction, constant focal length. The haze of
+  the forest is light added by distance, not a volume; part of the ambient light of all scenes is emission.
 - The archives are quantised; the table in `jaxsr/io/archive_coding.py` gives the errors of each layer.
 - Mirror-like reflections move otherwise than the motion vectors, which follow the surface.
 """

@@ -121,7 +121,7 @@ def upscale(
 
     Args:
         sequence: folder of the sequence.
-        method: one of the methods that README lists.
+        method: nearest, bilinear, bicubic, taau, guided or guided-taau.
         scale: of the low-resolution frames to start from; 0 takes the largest there is, 1 takes the
             high-resolution frames and makes only those between.
         every: every n-th frame counts as rendered; the others are extrapolated.
@@ -244,7 +244,12 @@ def main(arguments: list[str] | None = None) -> None:
         raise SystemExit(2) from None
     except KeyboardInterrupt:
         print("jaxsr: interrupted", file=sys.stderr)
-        raise SystemExit(130) from None
+        if arguments is not None:  # called from Python: the caller goes on
+            raise SystemExit(130) from None
+        # Tearing the interpreter down while XLA still compiles crashes; files are whole at any moment.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        os._exit(130)
     except BrokenPipeError:  # `jaxsr inspect SEQ | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None

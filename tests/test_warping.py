@@ -259,3 +259,15 @@ def test_bad_arguments():
         backward_warp(image, motion, boundary="wrap")
     with pytest.raises(JaxsrError, match="image sizes differ"):
         forward_splat.__wrapped__.__wrapped__(image, motion[:-1], motion[..., :1])
+
+
+def test_motion_has_two_channels():
+    image, depth = jnp.ones((4, 5, 3)), jnp.ones((4, 5, 1))
+    for channels in (1, 3):
+        motion = np.zeros((4, 5, channels), np.float32)
+        with pytest.raises(JaxsrError, match="not a motion; expected motion_px"):
+            backward_warp.__wrapped__.__wrapped__(image, motion)
+        with pytest.raises(JaxsrError, match="not a motion; expected motion_px"):
+            occlusion_motion.__wrapped__.__wrapped__(motion, depth)
+        with pytest.raises(JaxsrError, match="not a motion; expected motion_px"):
+            ops.reproject.__wrapped__.__wrapped__(image, motion, image, image)

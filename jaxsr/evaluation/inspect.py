@@ -142,7 +142,9 @@ def print_report(report: Report, console: Console | None = None) -> None:
     console.print(table)
     able = [name for name, lacks in report.missing.items() if not lacks]
     if able:
-        console.print(f"[green]✔[/] can run: {', '.join(able)}", highlight=False)
+        whole = report.level != "bad"
+        can = "[green]✔[/] can run" if whole else "[yellow]?[/] have their buffers, once the above is mended"
+        console.print(f"{can}: {', '.join(able)}", highlight=False)
     for name, lacks in report.missing.items():
         if lacks:
             console.print(f"[red]✘[/] {name} lacks {', '.join(lacks)}", highlight=False)

@@ -18,10 +18,14 @@
   let playing = 0, pointer = null, queued = false, hover = null;
 
   // Sources: what can be put on a side. Every section has the truth, perhaps the input, and its tracks.
+  const methods = [...new Set(data.sections.flatMap((s) => s.tracks.map((t) => t.name)))];
   for (const s of data.sections) {
     s.sources = [{ key: "truth", name: "Truth", color: "var(--truth)", images: s.truth }];
     if (s.input) s.sources.push({ key: "input", name: "Input", color: "var(--input)", images: s.input, note: s.input_note, flip: null });
-    s.tracks.forEach((t, i) => s.sources.push({ ...t, color: `var(--t${i % 10})`, dash: i > 9 ? "5 3" : "" }));
+    s.tracks.forEach((t) => {
+      const i = methods.indexOf(t.name); // a method has one colour on the whole page
+      s.sources.push({ ...t, color: `var(--t${i % 10})`, dash: i > 9 ? "5 3" : "" });
+    });
     s.hasFlip = s.tracks.some((t) => t.flip);
   }
   const section = () => data.sections[state.section];

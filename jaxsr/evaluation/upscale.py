@@ -73,7 +73,10 @@ def upscale(
 
 
 def _check_folder(out: Path, frames: set[int]) -> None:
-    """See that frames of another sequence do not mix with those to come."""
+    """See that frames of another sequence do not mix with those to come, before any work is done."""
+    for place in (out, *out.parents):
+        if place.exists() and not place.is_dir():
+            raise JaxsrError("not a folder", where=place, fix="choose another folder with --out")
     for kind in ("exr", "png"):
         for file in sorted((out / kind).glob(f"*.{kind}")):
             if not file.stem.isdigit() or int(file.stem) not in frames:

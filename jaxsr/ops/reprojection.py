@@ -130,6 +130,8 @@ def _check(
         raise JaxsrError(what, where="reproject", expected=expected, found=found)
 
     shapes = [jnp.shape(a) for a in (previous, motion, guide, previous_guide)]
+    if shapes[1][-1:] != (2,):
+        fail("not a motion", "motion_px [.., H, W, 2]", list(shapes[1]))
     if len({s[:-1] for s in shapes}) != 1:
         fail("image sizes differ", "equal [.., H, W]", shapes)
     if 0 in shapes[0]:

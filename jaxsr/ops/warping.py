@@ -52,7 +52,7 @@ def backward_warp(
         JaxsrError: unknown mode or boundary, or sizes that do not agree.
     """
     check_mode(mode, boundary)
-    _check_sizes("backward_warp", image, motion_px)
+    _check_sizes("backward_warp", motion_px, image)
     return over_batch(functools.partial(_warp, mode=mode, boundary=boundary), image, motion_px)
 
 
@@ -82,7 +82,7 @@ def forward_splat(
     Raises:
         JaxsrError: sizes that do not agree.
     """
-    _check_sizes("forward_splat", values, motion_px, depth_linear)
+    _check_sizes("forward_splat", motion_px, values, depth_linear)
 
     def splat(v: Array, motion: Array, depth: Array) -> tuple[Array, Array]:
         h, w, c = v.shape
@@ -132,9 +132,13 @@ def occlusion_motion(
     return over_batch(occlude, motion_px, depth_linear)
 
 
-def _check_sizes(where: str, *arrays: ArrayLike) -> None:
+def _check_sizes(where: str, motion_px: ArrayLike, *others: ArrayLike) -> None:
     """All arrays must agree but for the channels: jaxtyping says so only when it is switched on."""
-    shapes = [jnp.shape(a) for a in arrays]
+    shapes = [jnp.shape(a) for a in (motion_px, *others)]
+    if shapes[0][-1:] != (2,):
+        raise JaxsrError(
+            "not a motion", where=where, expected="motion_px [.., H, W, 2]", found=list(shapes[0])
+        )
     if len({shape[:-1] for shape in shapes}) != 1:
         raise JaxsrError("image sizes differ", where=where, expected="equal [.., H, W]", found=shapes)
 
