@@ -329,8 +329,9 @@
       `<tr data-key="${escape(t.key)}"><td title="${escape(t.note || "")}"><div><span class="swatch ${t.metrics ? "" : "none"}" style="--c:${t.color}"></span><span>${escape(t.name)}${t.note && !t.metrics ? `<small>${escape(t.note)}</small>` : ""}</span></div></td>` +
       ["left", "right"].map((side) => `<td><input type="radio" name="${side}" value="${escape(t.key)}" aria-label="${escape(t.name)} on the ${side}"></td>`).join("") + s.columns.map(() => '<td class="n"></td>').join("") + "</tr>").join("") + "</tbody>";
     for (const el of document.querySelectorAll(".result")) {
+      const colors = data.sections[+el.dataset.section].sources.filter((t) => t.metrics).map((t) => t.color);
       el.querySelectorAll("tbody tr").forEach((row, i) => {
-        if (!row.querySelector(".swatch")) row.firstElementChild.insertAdjacentHTML("afterbegin", `<span class="swatch" style="--c:var(--t${i % 10})"></span>`);
+        if (!row.querySelector(".swatch")) row.firstElementChild.insertAdjacentHTML("afterbegin", `<span class="swatch" style="--c:${colors[i]}"></span>`);
       });
     }
     const subsets = s.subsets.map(([name, count]) => [name, `${name[0].toUpperCase()}${name.slice(1)} (${count})`]);
