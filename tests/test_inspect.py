@@ -428,3 +428,14 @@ def test_long_sequences_are_sampled_in_pairs(tmp_path):
     report = inspect(Sequence.open(tmp_path), max_frames=4)
     assert report.frames_read == [1, 2, 8, 9]
     assert report.finding("motion").data["pairs"] == 2
+
+
+def test_jitter_of_one_frame_out_of_range(tmp_path):
+    """The median of many frames would hide it."""
+    seq = make_sequence(tmp_path / "s", frames=5)
+    head = json.loads((seq.path / "sequence.json").read_text())
+    head["frames"][2]["jitter_px"] = [5, 0]
+    (seq.path / "sequence.json").write_text(json.dumps(head))
+    report = inspect(Sequence.open(seq.path))
+    assert report.level == "bad"
+    assert "first frame 3: (5, 0)" in report.finding("jitter range").text

@@ -101,6 +101,13 @@ def inspect(
     findings += [judge_lr_motion(s, e) for s, e in evidence.lr_motion.items() if e]
     findings += [judge_jitter(s, e) for s, e in evidence.jitter.items()]
     findings += judge_normal(evidence)
+    far = [info for info in sequence.infos if np.abs(np.asarray(info.jitter_px)).max() > 0.5 + 1e-6]
+    if far:
+        x, y = (float(v) for v in far[0].jitter_px)
+        text = (
+            f"{len(far)} frames state more than half an LR pixel, first frame {far[0].index}: ({x:g}, {y:g})"
+        )
+        findings.append(Finding("jitter range", "bad", f"{text}; expected each within [-0.5, 0.5]"))
     missing = {name: _lacks(sequence, set(wanted), stats) for name, wanted in (needs or {}).items()}
     return Report(
         path=str(sequence.path),
