@@ -1,4 +1,4 @@
-"""The conventions, and the three small pytrees that carry them. Nothing else in jaxsr defines any.
+"""The conventions, and the small pytrees that carry them. Nothing else in jaxsr defines any.
 
 Arrays are channels-last: images `[H, W, C]`, batches `[B, H, W, C]`, float32.
 
@@ -71,8 +71,21 @@ class Frame(NamedTuple):
     """True where this frame does not continue the one before it: history must be dropped."""
     rendered: Bool[Array, "*b"]
     """False where the frame was never shaded."""
+    exposure: Float[Array, "*b"]
+    """Factor on linear colour before the display tone map."""
 
     @property
     def scale(self) -> int:
         """HR size divided by LR size."""
         return self.hr.depth_linear.shape[-3] // self.color_linear.shape[-3]
+
+
+class Window(NamedTuple):
+    """Consecutive frames, or crops of them, with their truth: what training sees and inference never does.
+
+    A batch of windows has `[B, T]` in front of the shapes of one frame; the last frame is the one to make.
+    """
+
+    frames: Frame
+    truth_linear: Float[Array, "*b H W 3"]
+    """HR colour of each frame, scene-linear, not jittered."""

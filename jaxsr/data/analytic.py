@@ -282,7 +282,7 @@ def frame(
     lr = render(time, (size[0] // scale, size[1] // scale), jitter_px=jitter_px)
     view = Camera(*(value.astype(np.float32) for value in camera(time, size)))
     color: Any = lr["color"] if rendered else np.zeros_like(lr["color"])
-    flags: Any = (np.asarray(time == 0), np.asarray(rendered))
+    flags: Any = (np.asarray(time == 0), np.asarray(rendered), np.ones((), np.float32))
     jitter: Any = np.asarray(jitter_px, np.float32)
     result = Frame(
         color_linear=color,
@@ -292,6 +292,7 @@ def frame(
         camera=view,
         cut=flags[0],
         rendered=flags[1],
+        exposure=flags[2],
     )
     return result, hr["color"]
 

@@ -116,6 +116,7 @@ class Sequence:
             camera=info.camera,
             cut=np.asarray(info.cut),  # type: ignore[arg-type]
             rendered=np.asarray(rendered),  # type: ignore[arg-type]
+            exposure=np.asarray(self.exposure, np.float32),  # type: ignore[arg-type]
         )
 
     def truth(self, i: int) -> Float[np.ndarray, "H W 3"]:

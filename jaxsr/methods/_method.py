@@ -1,19 +1,22 @@
 """What a method is: a pure step over a sequence, and what it needs to take that step."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from flax import nnx
 from jaxtyping import Array, Float
 
-from jaxsr.frames import Frame
+from jaxsr.frames import Frame, Window
 
 State = Any
 """A pytree of arrays; constant in size whatever the length of the clip."""
 Net = Any
-"""A pytree of parameters; None for methods that learn nothing."""
+"""A pytree of parameters (an `nnx.State`); None for methods that learn nothing."""
 Step = Callable[[Net, State, Frame], tuple[State, Float[Array, "H W 3"]]]
+Loss = Callable[[nnx.Module, Window], tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
 
 
 class Method(NamedTuple):
@@ -32,6 +35,14 @@ class Method(NamedTuple):
     step: Step
     needs: frozenset[str]
     """Buffers by size and name, for instance "lr.color" or "hr.normal"."""
+    new_net: Callable[[nnx.Rngs], nnx.Module] | None = None
+    """A fresh network, whose `nnx.state` is what `step` takes as `net`; None where nothing is learned."""
+    loss: Loss | None = None
+    """`loss(net, window) -> total, parts` on a batch of windows, in the net's training mode."""
+    window: int = 1
+    """Consecutive frames that `loss` wants in a window."""
+    arguments: Mapping[str, Any] = MappingProxyType({})
+    """What a file of weights must record to build this method again: `methods.build(name, arguments)`."""
 
 
 def by_rendered(
