@@ -15,7 +15,8 @@ from jaxsr.methods import METHODS, taau
 from jaxsr.ops import jitter_sequence, to_display
 
 SIZE = (96, 54)
-NAMES = sorted(METHODS)
+NAMES = sorted(name for name, method in METHODS.items() if method.new_net is None)
+"""Those that learn nothing; tests/test_fusion_sr.py has the others."""
 
 
 @functools.cache

@@ -123,6 +123,10 @@ class Sequence:
         """The HR colour, scene-linear."""
         return self._read(i, "hr", only=("color",), need=("color",))["color"]
 
+    def stored(self, i: int, resolution: str) -> dict[str, np.ndarray]:
+        """The layers of frame number `i` in "hr", "x2", ..., but for position, in the types of the file."""
+        return self._read(i, self._resolution(resolution), skip=("position",), stored=True)
+
     def position(self, i: int, scale: int | str) -> Float[np.ndarray, "h w 3"]:
         """World position of every pixel of an LR scale or of "hr" (what the jittered pixel sees); 0 for sky.
 
@@ -169,6 +173,7 @@ class Sequence:
         only: tuple[str, ...] = tuple(LAYERS),
         skip: tuple[str, ...] = (),
         need: tuple[str, ...] = (),
+        stored: bool = False,
     ) -> dict[str, np.ndarray]:
         index = self._info(i).index
         path = frame_file(self.path, resolution, index)
@@ -186,7 +191,8 @@ class Sequence:
                     expected=", ".join(names),
                     found=", ".join(sorted(channels)),
                 )
-            layers[layer] = np.stack([channels[n].astype(np.float32) for n in names], -1)
+            x = np.stack([channels[n] for n in names], -1)
+            layers[layer] = x if stored else x.astype(np.float32)
         for layer in need:
             if layer not in layers:
                 raise self._missing(

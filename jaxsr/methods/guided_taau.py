@@ -52,22 +52,27 @@ def same_surface(gbuffer: GBuffer, sigma_guide: float) -> taau.Alike:
     return alike
 
 
+def estimate(frame: Frame, options: Options) -> taau.Estimate:
+    """What one frame says of the lighting of each HR pixel, in the working space of TAAU."""
+    lr = frame.lr
+    lighting = taau.to_working(demodulate(frame.color_linear, guided.surface(lr)[0]))
+    features = jnp.concatenate([lighting, guided.guide(lr), 1 / lr.depth_linear], -1)
+    alike = same_surface(frame.hr, options.sigma_guide)
+    return taau.estimate(features, frame.jitter_px, frame.scale, options.temporal, alike)
+
+
 def method(options: Options | None = None, reprojection: guided.Options | None = None) -> Method:
     """Guided temporal upsampling, and guided reprojection where nothing was rendered."""
     o = options or Options()
     r = reprojection or guided.Options()
 
     def upscale(net: None, state: guided.State, frame: Frame) -> tuple[guided.State, Array]:
-        hr, lr = frame.hr, frame.lr
+        hr = frame.hr
         if frame.scale == 1:
             image = frame.color_linear
             history = taau.State(image, jnp.full_like(hr.depth_linear, o.temporal.memory), hr.depth_linear)
             return guided.State(history, *guided.surface(hr)), image
-        lighting = taau.to_working(demodulate(frame.color_linear, guided.surface(lr)[0]))
-        features = jnp.concatenate([lighting, guided.guide(lr), 1 / lr.depth_linear], -1)
-        now = taau.estimate(
-            features, frame.jitter_px, frame.scale, o.temporal, same_surface(hr, o.sigma_guide)
-        )
+        now = estimate(frame, o)
         previous = state.history
         before, weight = taau.fetch_history(
             taau.to_working(demodulate(previous.image, state.base_color)),

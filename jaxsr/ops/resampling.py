@@ -244,16 +244,28 @@ def upsample(
 
 
 @functools.partial(jax.jit, static_argnames=("scale",))
-def zero_upsample(image: Float[Array, "*b h w c"], scale: int) -> Float[Array, "*b h2 w2 c"]:
+def zero_upsample(
+    image: Float[Array, "*b h w c"], scale: int, offset: Int[Array, "*b 2"] | None = None
+) -> Float[Array, "*b h2 w2 c"]:
     """`O[y, x] = I[y / s, x / s]` where s divides both, else 0: each sample sits top left in its block.
+
+    Args:
+        image: any range, any number of channels; batch axes lead.
+        scale: s, the size of a block.
+        offset: (x, y) in [0, s), where in its block the sample sits instead, one an image; the values may be
+            traced. `O[y, x] = I[(y - offset_y) / s, (x - offset_x) / s]`. Out of range, nothing is placed.
 
     Raises:
         JaxsrError: a scale below 1.
     """
     _check_scale(scale)
     *batch, height, width, channels = image.shape
-    spread = jnp.zeros((*batch, height, scale, width, scale, channels), image.dtype)
-    spread = spread.at[..., 0, :, 0, :].set(image)
+    if offset is None:
+        offset = jnp.zeros((*batch, 2), jnp.int32)
+    place = offset[..., None] == jnp.arange(scale, dtype=offset.dtype).reshape((1,) * offset.ndim + (scale,))
+    # [..., 1, dy, 1, dx, 1]; a comparison and a select: a scatter would not fuse, a product would spread NaN.
+    here = place[..., 1, None, :, None, None, None] & place[..., 0, None, None, None, :, None]
+    spread = jnp.where(here, image[..., :, None, :, None, :], jnp.zeros((), image.dtype))
     return spread.reshape(*batch, height * scale, width * scale, channels)
 
 

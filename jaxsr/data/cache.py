@@ -1,0 +1,252 @@
+"""Sequences as memory-mapped arrays: decoding OpenEXR costs far more than a training step's crop of it.
+
+Each resolution of a sequence ("hr", "x2", ...) is converted once, when it is first asked for, to one file
+`[N, H, W, C]` a layer in the type of the OpenEXR channels, under
+
+    <cache>/<name of the folder>-<hash of its path>/<resolution>-<key>/   color.npy depth.npy ... arrays.json
+
+The key is made of the bytes of `sequence.json` and the sizes and times of the frames' files: a sequence that
+was changed is converted again, and what was made of its earlier state is deleted. A conversion is written
+under a temporary name and renamed when it is whole; processes that convert the same one at the same time do
+not disturb each other. Pixels are checked as `Sequence` does. Positions are not kept: no frame has them.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, BinaryIO, NamedTuple
+
+import numpy as np
+
+from jaxsr.errors import JaxsrError
+from jaxsr.io.sequence import Sequence
+from jaxsr.io.writing import LAYERS, frame_file
+
+Progress = Callable[[str, int], Callable[[], Any]]
+"""Called with a title and a number of steps; returns what is called after each step."""
+
+_VERSION = 1
+_ABANDONED_SECONDS = 3600.0  # a conversion writes a frame in a second or so: after an hour its writer is dead
+_WORKERS = 4
+
+
+class Arrays(NamedTuple):
+    """A sequence, and the memory maps of one of its resolutions."""
+
+    sequence: Sequence
+    resolution: str
+    layers: dict[str, np.ndarray]
+    """Layer -> `[N, H, W, C]`, read-only, of float16, float32 or uint32; read from disk as it is touched."""
+    absent: dict[str, int]
+    """Layer that some frames have and others lack -> the number of the first frame that lacks it."""
+
+
+def default_cache() -> Path:
+    """`$XDG_CACHE_HOME/jaxsr/arrays`, by default `~/.cache/jaxsr/arrays`."""
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsr" / "arrays"
+
+
+def open_arrays(
+    path: str | Path,
+    resolutions: Iterable[str],
+    *,
+    cache: Path | None = None,
+    progress: Progress | None = None,
+) -> dict[str, Arrays]:
+    """Memory maps of a sequence, which is converted first where that was not done yet.
+
+    Args:
+        path: the folder of the sequence.
+        resolutions: some of "hr", "x2", ...
+        cache: folder of the arrays; `default_cache()` by default.
+        progress: told of each frame that is converted.
+
+    Returns:
+        Resolution -> its arrays.
+
+    Raises:
+        JaxsrError: not a sequence, no such resolution, damaged or wrong pixels (the file is named), a
+            sequence that changes while it is read, a cache that cannot be written.
+    """
+    seq = Sequence.open(path)
+    home = (default_cache() if cache is None else Path(cache)) / _name(seq.path)
+    found = {}
+    for resolution in resolutions:
+        seq.layers(resolution)  # says which there are, if this is none
+        found[resolution] = _open(seq, resolution, home, progress)
+    return found
+
+
+def source_key(seq: Sequence, resolution: str, times: bool = True) -> str:
+    """A hash that changes with `sequence.json` and with the files of a resolution.
+
+    Args:
+        times: count the times of modification in, which change when files are copied.
+    """
+    digest = hashlib.sha256(f"{_VERSION} {resolution}\n".encode())
+    try:
+        digest.update((seq.path / "sequence.json").read_bytes())
+        for info in seq.infos:
+            stat = frame_file(seq.path, resolution, info.index).stat()
+            digest.update(f"{info.index} {stat.st_size} {stat.st_mtime_ns if times else 0}\n".encode())
+    except OSError as e:
+        raise JaxsrError("cannot be read", where=e.filename or seq.path, found=e.strerror or e) from e
+    return digest.hexdigest()
+
+
+def _name(path: Path) -> str:
+    path = path.resolve()
+    return f"{path.name}-{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
+
+
+def _open(seq: Sequence, resolution: str, home: Path, progress: Progress | None) -> Arrays:
+    key = source_key(seq, resolution)
+    folder = home / f"{resolution}-{key[:16]}"
+    if not folder.is_dir():
+        try:
+            _convert(seq, resolution, key, folder, progress)
+        except OSError as e:
+            raise JaxsrError(
+                "the arrays of a sequence cannot be written",
+                where=folder,
+                found=e.strerror or e,
+                fix="make room, or choose another folder for the cache",
+            ) from e
+        _remove_stale(home, resolution, folder)
+    try:
+        head = json.loads((folder / "arrays.json").read_text(encoding="utf-8"))
+        layers = {n: _map(folder / f"{n}.npy") for n in head["layers"]}
+        return Arrays(seq, resolution, layers, head["absent"])
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        fix = "delete that folder: it is made again"
+        raise JaxsrError("the arrays of a sequence cannot be read", where=folder, found=e, fix=fix) from e
+
+
+def _map(path: Path) -> np.ndarray:
+    # A plain view: slices of the subclass cost several times as much.
+    return np.load(path, mmap_mode="r").view(np.ndarray)
+
+
+def _convert(seq: Sequence, resolution: str, key: str, folder: Path, progress: Progress | None) -> None:
+    advance = progress(f"convert {seq.path.name}", len(seq)) if progress is not None else lambda: None
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    temporary = folder.with_name(f".{folder.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    shutil.rmtree(temporary, ignore_errors=True)
+    temporary.mkdir()
+    with contextlib.ExitStack() as stack:
+        stack.callback(shutil.rmtree, temporary, ignore_errors=True)
+        files = {n: stack.enter_context(_LayerFile(temporary / f"{n}.npy", len(seq))) for n in LAYERS}
+        for i, layers in enumerate(_frames(seq, resolution)):
+            for name, pixels in layers.items():
+                files[name].append(i, pixels)
+            advance()
+        for file in files.values():
+            file.close()
+        if source_key(seq, resolution) != key:
+            raise JaxsrError(
+                "the sequence changed while it was read", where=seq.path, fix="let its writer finish first"
+            )
+        whole = [n for n, file in files.items() if file.count == len(seq)]
+        for name in set(files) - set(whole):
+            (temporary / f"{name}.npy").unlink(missing_ok=True)
+        head = {
+            "version": _VERSION,
+            "key": key,
+            "source": str(seq.path.resolve()),
+            "layers": whole,
+            "absent": {n: seq.infos[f.count].index for n, f in files.items() if f.seen and n not in whole},
+            "sequence": json.loads((seq.path / "sequence.json").read_text(encoding="utf-8")),
+        }
+        (temporary / "arrays.json").write_text(json.dumps(head, indent=1), encoding="utf-8")
+        try:
+            temporary.rename(folder)
+        except OSError:
+            if not folder.is_dir():  # else another process was first, with the same
+                raise
+
+
+def _frames(seq: Sequence, resolution: str) -> Iterator[dict[str, np.ndarray]]:
+    """Decoded in threads, a few frames ahead."""
+    with ThreadPoolExecutor(_WORKERS) as pool:
+        for start in range(0, len(seq), _WORKERS):
+            block = range(start, min(start + _WORKERS, len(seq)))
+            yield from pool.map(lambda i: seq.stored(i, resolution), block)
+
+
+class _LayerFile:
+    """A `.npy` file that grows by a frame at a time. Not a writable memory map: a full disk would kill us."""
+
+    def __init__(self, path: Path, frames: int):
+        self.path, self.frames = path, frames
+        self.seen, self.count = False, 0  # whether any frame has the layer; how many do, from the first on
+        self.shape: tuple[int, ...] = ()
+        self.dtype: np.dtype = np.dtype(np.float16)
+        self.file: BinaryIO | None = None
+
+    def __enter__(self) -> "_LayerFile":
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    def append(self, i: int, pixels: np.ndarray) -> None:
+        self.seen = True
+        if self.count < i:
+            return  # an earlier frame lacks the layer: it is of no use
+        if self.file is None:
+            self.shape, self.dtype = pixels.shape, _storable(pixels.dtype)
+            self._begin()
+        elif pixels.dtype != self.dtype:
+            self._widen()
+        assert self.file is not None
+        self.file.write(np.ascontiguousarray(pixels, self.dtype).data)
+        self.count += 1
+
+    def close(self) -> None:
+        if self.file is not None:
+            self.file.close()
+
+    def _begin(self) -> None:
+        self.file = self.path.open("wb")
+        header = {"descr": self.dtype.str, "fortran_order": False, "shape": (self.frames, *self.shape)}
+        np.lib.format.write_array_header_1_0(self.file, header)
+
+    def _widen(self) -> None:
+        """The type changes on the way (large object ids, say): float32 for all, as `Sequence` reads them."""
+        if self.dtype == np.float32:
+            return
+        self.close()
+        narrow, pixels = self.path.with_suffix(".narrow"), int(np.prod(self.shape))
+        self.path.rename(narrow)
+        with narrow.open("rb") as old:
+            np.lib.format.read_magic(old)
+            np.lib.format.read_array_header_1_0(old)
+            dtype, self.dtype = self.dtype, np.dtype(np.float32)
+            self._begin()
+            assert self.file is not None
+            for _ in range(self.count):
+                self.file.write(np.fromfile(old, dtype, pixels).astype(np.float32).data)
+        narrow.unlink()
+
+
+def _storable(dtype: np.dtype) -> np.dtype:
+    return dtype if dtype in (np.float16, np.float32, np.uint32) else np.dtype(np.float32)
+
+
+def _remove_stale(home: Path, resolution: str, keep: Path) -> None:
+    """Delete what was made of earlier states of the sequence, and what killed conversions left."""
+    for old in home.glob(f"{resolution}-*"):
+        if old != keep:
+            shutil.rmtree(old, ignore_errors=True)
+    for old in home.glob(f".{resolution}-*.tmp"):
+        with contextlib.suppress(OSError):
+            touched = max(p.stat().st_mtime for p in (old, *old.iterdir()))
+            if time.time() - touched > _ABANDONED_SECONDS:
+                shutil.rmtree(old, ignore_errors=True)
