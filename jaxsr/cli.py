@@ -1,4 +1,4 @@
-"""The command line: `jaxsr demo | inspect | compare | upscale | render`.
+"""The command line: `jaxsr demo | inspect | compare | upscale | evaluate | render | train | convert-weights`.
 
 A mistake in the input is one line on stderr and exit status 2. Heavy imports wait until a command runs, so
 that `jaxsr --help` answers at once.
@@ -84,6 +84,7 @@ def compare(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("jaxsr-compare"),
     exposure: float | None = None,
     fps: float = 4.0,
+    lpips: bool = True,
 ) -> None:
     """Measure folders of frames against the truth and write the comparison page.
 
@@ -93,16 +94,25 @@ def compare(
         out: folder for the page and the metrics.
         exposure: factor on linear colour before the tone map; that of the truth, else 1.
         fps: speed at which the page plays at first.
+        lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes most of the time.
     """
     from rich.console import Console
 
     from jaxsr.evaluation.compare import compare as compare_folders
     from jaxsr.evaluation.demo import description
+    from jaxsr.evaluation.measuring import metrics_with
     from jaxsr.evaluation.tables import rich_tables
 
     with bars() as progress:
         section = compare_folders(
-            folders, truth, out, exposure=exposure, fps=fps, meta=description(), progress=progress
+            folders,
+            truth,
+            out,
+            exposure=exposure,
+            fps=fps,
+            meta=description(),
+            keys=metrics_with(lpips),
+            progress=progress,
         )
     for table in rich_tables([section]):
         Console().print(table)
@@ -121,7 +131,7 @@ def upscale(
 
     Args:
         sequence: folder of the sequence.
-        method: nearest, bilinear, bicubic, taau, guided or guided-taau.
+        method: nearest, bilinear, bicubic, taau, guided, guided-taau or fusion-sr; or a file of weights.
         scale: of the low-resolution frames to start from; 0 takes the largest there is, 1 takes the
             high-resolution frames and makes only those between.
         every: every n-th frame counts as rendered; the others are extrapolated.
@@ -132,20 +142,66 @@ def upscale(
     from jaxsr.io.sequence import Sequence
 
     opened = Sequence.open(sequence)
+    scale = scale or max(opened.scales, default=1)
+    ready = find_method(method, scale)
     with bars() as progress:
-        _, timing = upscale_sequence(
-            opened,
-            find_method(method),
-            out,
-            scale=scale or max(opened.scales, default=1),
-            every=every,
-            advance=progress("frames", len(opened)),
-            keep=False,
+        timing = upscale_sequence(
+            opened, ready, out, scale=scale, every=every, advance=progress("frames", len(opened))
         )
     print(
         f"{len(opened)} frames in {out}: {timing.median_ms:.1f} ms a frame, "
         f"compiled in {timing.compile_s:.1f} s"
     )
+
+
+@app.command
+def evaluate(
+    sequences: Positional[tuple[Path, ...]],
+    methods: str = "bicubic,taau,guided-taau,fusion-sr",
+    scale: int = 4,
+    every: int = 1,
+    frames: Annotated[str | None, tyro.conf.arg(metavar="A:B")] = None,
+    warmup: int = 0,
+    lpips: bool = True,
+    out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("jaxsr-evaluation"),
+) -> None:
+    """Run methods over sequences and measure them: tables, the comparison page, metrics of every frame.
+
+    Each metric is over all pixels, over edges, and over disocclusions. What is finished is kept: an
+    interrupted evaluation goes on when it is run again.
+
+    Args:
+        sequences: folders of sequences with truth, or folders that hold such folders.
+        methods: names, or files of weights (*.safetensors), with commas between.
+        scale: of the low-resolution frames to start from.
+        every: every n-th frame counts as rendered; the others are extrapolated.
+        frames: first and last frame; all by default.
+        warmup: so many frames at the start of each sequence are made, and not measured.
+        lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes most of the time.
+        out: folder for everything that is made.
+    """
+    from rich.console import Console
+
+    from jaxsr.evaluation.demo import description
+    from jaxsr.evaluation.evaluate import evaluate as evaluate_methods
+    from jaxsr.evaluation.measuring import metrics_with
+    from jaxsr.evaluation.tables import rich_tables
+    from jaxsr.evaluation.upscale import Settings
+
+    settings = Settings(scale, every, warmup, metrics_with(lpips))
+    with bars() as progress:
+        sections = evaluate_methods(
+            sequences,
+            [name.strip() for name in methods.split(",") if name.strip()],
+            out,
+            settings,
+            frames=_frame_range(frames),
+            meta=description(**settings._asdict()),
+            progress=progress,
+        )
+    for table in rich_tables(sections, brief=len(sections) > 1):
+        Console().print(table)
+    print(f"Open {out / 'report.html'}; metrics.json, .csv and .md, and the frames are beside it.")
 
 
 @app.command
@@ -221,6 +277,38 @@ def render(
     print(f"{out}: look through it with `jaxsr inspect {out}`")
 
 
+@app.command
+def convert_weights(
+    source: Positional[Path],
+    out: Positional[Path],
+    method: str = "fusion-sr",
+    scale: int = 4,
+    buffers: tuple[str, ...] = (),
+    half: bool = False,
+) -> None:
+    """Convert published weights (.pth, .npz, .safetensors) to jaxsr's. No code in them runs.
+
+    Args:
+        source: the published file.
+        out: the file to write, ending in .safetensors.
+        method: that the weights are for; which variant of it follows from their shapes.
+        scale: that they were trained for.
+        buffers: the network's G-buffer channels, in order, where it has not all of them in the paper's order.
+        half: store float16.
+    """
+    from jaxsr.convert import convert_published
+
+    arguments = convert_published(source, out, method, scale=scale, buffers=buffers or None, half=half)
+    print(f"{out}: {method}, " + ", ".join(f"{name} {value}" for name, value in arguments.items()))
+
+
+@app.command(name="train")
+def _train() -> None:
+    """Train the network of a method: `jaxsr train fusion-sr --help` lists the options."""
+    # `main` passes everything after "train" on: which options there are depends on the method's name.
+    raise JaxsrError("no method to train", where="jaxsr train", fix="see jaxsr train --help")
+
+
 def _frame_range(text: str | None) -> tuple[int, int] | None:
     """ "a:b" as two frame numbers; one number alone is that frame."""
     if text is None:
@@ -237,7 +325,12 @@ def _frame_range(text: str | None) -> tuple[int, int] | None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 and one line on bad input."""
+    given = sys.argv[1:] if arguments is None else arguments
     try:
+        if given[:1] == ["train"]:
+            from jaxsr.training.command import run
+
+            return run(given[1:])
         app.cli(prog="jaxsr", args=arguments, description="Cheap renders in, expensive-looking frames out.")
     except JaxsrError as error:
         print(f"jaxsr: {error}", file=sys.stderr)

@@ -1,20 +1,24 @@
-"""Image quality on display-referred images: PSNR, SSIM, FLIP, and the PSNR of frame differences.
+"""Image quality on display-referred images: PSNR, SSIM, LPIPS, FLIP, and the PSNR of frame differences.
 
 All take images `[H, W, 3]` in [0, 1], sRGB-encoded after the tone map (`jaxsr.ops.color.to_display`). `psnr`,
-`ssim` and `flip` return a Python float, `flip_map` an array `[H, W]`; `temporal_psnr` and `measure` take
-frames in order and return lists of one float or None a frame. No metric crops, converts to luma, or
+`ssim`, `lpips` and `flip` return a Python float, `flip_map` an array `[H, W]`; `temporal_psnr` and `measure`
+take frames in order and return lists of one float or None a frame. No metric crops, converts to luma, or
 quantises. Values outside [0, 1], NaN and unequal shapes are errors, never a number. They compute on the host
-and are no losses.
+and are no losses (those are in `jaxsr.losses`).
 
 A mask `[H, W]` (True: counts) restricts the average to its pixels; nothing is cut out before filtering, so
-SSIM and FLIP there still see the neighbours of masked pixels. An empty mask is an error.
+SSIM, LPIPS and FLIP there still see the neighbours of masked pixels. An empty mask is an error.
+`measure_frame` has every metric of a frame over all pixels and over any regions, and makes each map once.
+
+LPIPS needs the extra `perceptual`; without it `available` has no "lpips", and `measure` leaves it out. It
+costs several times as much as all the others together.
 
 PSNR of identical images is `inf`; tables.py writes that as the string "inf" in JSON, for JSON has no number
 for it. A value that is not defined (the temporal PSNR of the first frame) is None, `null` in JSON.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
 
 import dm_pix
@@ -23,13 +27,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxsr import perceptual
 from jaxsr.errors import JaxsrError
+from jaxsr.losses import SSIM_WINDOW, gaussian_window
 
 Image: TypeAlias = Float[Array | np.ndarray, "h w 3"]
 Mask: TypeAlias = Bool[Array | np.ndarray, "h w"]
 
-SSIM_WINDOW = 11
-SSIM_SIGMA = 1.5
 FLIP_PPD = 3840 * math.pi / 180
 """67.02 pixels per degree: a 0.7 m wide display of 3840 pixels seen from 0.7 m, FLIP's own default."""
 
@@ -59,6 +63,14 @@ METRICS: dict[str, Metric] = {
         4,
         "Wang et al. 2004: 11x11 Gaussian window, sigma 1.5, K1 0.01, K2 0.03, per channel and averaged, "
         "over the pixels whose window lies inside the image.",
+    ),
+    "lpips": Metric(
+        "LPIPS",
+        "",
+        False,
+        4,
+        "Zhang et al. 2018, LPIPS v0.1 over VGG-16, of the whole display-referred image at its own size. "
+        "Over a region: the mean there of the layers' maps, enlarged bilinearly.",
     ),
     "flip": Metric(
         "FLIP",
@@ -107,10 +119,14 @@ def _checked(image: Array | np.ndarray, truth: Array | np.ndarray) -> tuple[np.n
     return pair[0], pair[1]
 
 
-def _checked_mask(mask: Array | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+def _sized_mask(mask: Array | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
     if mask.shape != shape:
         raise JaxsrError("mask has the wrong size", expected=shape, found=mask.shape)
-    array = np.asarray(mask)
+    return np.asarray(mask)
+
+
+def _checked_mask(mask: Array | np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    array = _sized_mask(mask, shape)
     if not array.any():
         raise JaxsrError("mask is empty: there is no pixel to measure on")
     return array
@@ -133,20 +149,9 @@ def psnr(image: Image, truth: Image, mask: Mask | None = None) -> float:
     return _psnr_of(image_ - truth_, mask)
 
 
-def _gaussian(image: Array) -> Array:
-    """The window of SSIM over rows, then columns, where it lies inside the image."""
-    weights = np.exp(-0.5 * ((np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2) / SSIM_SIGMA) ** 2)
-    taps = [float(w) for w in weights / weights.sum()]
-    h, w = (n - SSIM_WINDOW + 1 for n in image.shape[:2])
-    # Sums of shifted images take a third of the time of dm-pix's own convolutions on a CPU. The barrier keeps
-    # XLA from fusing both passes into 121 taps a pixel.
-    rows = jax.lax.optimization_barrier(sum(t * image[k : k + h] for k, t in enumerate(taps)))
-    return sum(t * rows[:, k : k + w] for k, t in enumerate(taps))
-
-
 @jax.jit
 def _ssim_map(image: Array, truth: Array) -> Array:
-    return dm_pix.ssim(image, truth, k1=0.01, k2=0.03, return_map=True, filter_fn=_gaussian)
+    return dm_pix.ssim(image, truth, k1=0.01, k2=0.03, return_map=True, filter_fn=gaussian_window)
 
 
 def ssim(image: Image, truth: Image, mask: Mask | None = None) -> float:
@@ -164,12 +169,47 @@ def ssim(image: Image, truth: Image, mask: Mask | None = None) -> float:
             expected=f"at least {SSIM_WINDOW}x{SSIM_WINDOW}",
             found=truth_.shape[:2],
         )
-    ssim_map = np.asarray(_ssim_map(image_, truth_)).mean(axis=-1, dtype=np.float64)
+    return _average(_channel_mean(_ssim_map(image_, truth_)), mask, SSIM_WINDOW // 2)
+
+
+def _channel_mean(ssim_map: Array) -> np.ndarray:
+    return np.asarray(ssim_map).mean(axis=-1, dtype=np.float64)
+
+
+def _average(values: np.ndarray, mask: Mask | None, edge: int = 0) -> float:
+    """Mean of a map, `edge` pixels smaller than the image on each side, over a mask of the image."""
     if mask is not None:
-        edge = SSIM_WINDOW // 2
-        inner = _checked_mask(mask, truth_.shape[:2])[edge:-edge, edge:-edge]
-        ssim_map = ssim_map[_checked_mask(inner, ssim_map.shape)]
-    return float(ssim_map.mean())
+        shape = (values.shape[0] + 2 * edge, values.shape[1] + 2 * edge)
+        inner = _checked_mask(mask, shape)[edge : shape[0] - edge, edge : shape[1] - edge]
+        values = values[_checked_mask(inner, values.shape)]
+    return float(values.mean(dtype=np.float64))
+
+
+@jax.jit
+def _lpips_value(image: Array, truth: Array, params: perceptual.Params) -> Array:
+    return perceptual.lpips(image, truth, "vgg", params)
+
+
+@jax.jit
+def _lpips_maps(image: Array, truth: Array, params: perceptual.Params) -> tuple[Array, Array]:
+    """The value and the map. The networks run once: the compiler sees that both have the same."""
+    found = perceptual.lpips_map(image, truth, "vgg", params)
+    return perceptual.lpips(image, truth, "vgg", params), found
+
+
+def lpips(image: Image, truth: Image, mask: Mask | None = None) -> float:
+    """LPIPS v0.1 over VGG-16 (Zhang et al. 2018): 0 for identical images, lower is better.
+
+    Over a mask it is the mean of `jaxsr.perceptual.lpips_map`. Compiled once a size.
+
+    Raises:
+        JaxsrError: as for `psnr`, images below 16x16, and where the extra `perceptual` is not installed.
+    """
+    image_, truth_ = _checked(image, truth)
+    params = perceptual.load_params("vgg")
+    if mask is None:
+        return float(_lpips_value(image_, truth_, params))
+    return _average(np.asarray(_lpips_maps(image_, truth_, params)[1]), mask)
 
 
 def flip_map(image: Image, truth: Image, ppd: float = FLIP_PPD) -> Float[np.ndarray, "h w"]:
@@ -195,10 +235,7 @@ def flip(image: Image, truth: Image, mask: Mask | None = None, ppd: float = FLIP
     Raises:
         JaxsrError: as for `flip_map`, and an empty mask.
     """
-    error = flip_map(image, truth, ppd)
-    if mask is not None:
-        error = error[_checked_mask(mask, error.shape)]
-    return float(error.mean(dtype=np.float64))
+    return _average(flip_map(image, truth, ppd), mask)
 
 
 def temporal_psnr(
@@ -223,10 +260,7 @@ def temporal_psnr(
     Raises:
         JaxsrError: unequal lengths, and as for `psnr`.
     """
-    if len(images) != len(truths):
-        raise JaxsrError("unequal number of frames", expected=f"{len(truths)} (truth)", found=len(images))
-    if starts is not None and len(starts) != len(truths):
-        raise JaxsrError("starts has the wrong length", expected=len(truths), found=len(starts))
+    _check_lengths(images, truths, starts)
     values: list[float | None] = []
     previous: np.ndarray | None = None
     for t, (image, truth) in enumerate(zip(images, truths, strict=True)):
@@ -235,11 +269,93 @@ def temporal_psnr(
         if previous is None or (starts is not None and starts[t]):
             values.append(None)
         else:
-            if previous.shape != error.shape:
-                raise JaxsrError("frames differ in size", expected=previous.shape, found=error.shape)
-            values.append(_psnr_of(error - previous, mask))
+            values.append(_psnr_of(_change(error, previous), mask))
         previous = error
     return values
+
+
+def _check_lengths(images: Sequence[Image], truths: Sequence[Image], starts: Sequence[bool] | None) -> None:
+    if len(images) != len(truths):
+        raise JaxsrError("unequal number of frames", expected=f"{len(truths)} (truth)", found=len(images))
+    if starts is not None and len(starts) != len(truths):
+        raise JaxsrError("starts has the wrong length", expected=len(truths), found=len(starts))
+
+
+def _change(error: np.ndarray, previous: np.ndarray) -> np.ndarray:
+    if previous.shape != error.shape:
+        raise JaxsrError("frames differ in size", expected=previous.shape, found=error.shape)
+    return error - previous
+
+
+def available() -> tuple[str, ...]:
+    """Keys of the metrics that can be computed here: `METRICS`, less "lpips" where its extra is absent."""
+    return tuple(key for key in METRICS if key != "lpips" or perceptual.installed())
+
+
+def measure_frame(
+    image: Image,
+    truth: Image,
+    *,
+    before: tuple[Image, Image] | None = None,
+    regions: Mapping[str, Mask] | None = None,
+    flip_error: Float[np.ndarray, "h w"] | None = None,
+    keys: Collection[str] | None = None,
+) -> dict[str, dict[str, float | None]]:
+    """Every metric of one frame: over "all" pixels, and over each region.
+
+    Args:
+        image, truth: of the frame, display-referred.
+        before: image and truth of the frame before it; None at a start, where the temporal PSNR is None.
+        regions: masks by name. Where one has no pixels (for SSIM: none 5 pixels from the border) it has None.
+        flip_error: `flip_map` of the frame at its default distance, if it was made already.
+        keys: which metrics; all of `available` by default.
+
+    Returns:
+        region -> metric -> value. Images too small for SSIM or LPIPS have None there.
+
+    Raises:
+        JaxsrError: as for `psnr`; an unknown metric; a region named "all"; "lpips" asked for without its
+        extra.
+    """
+    keys = available() if keys is None else keys
+    regions = regions or {}
+    if unknown := sorted(set(keys) - set(METRICS)):
+        raise JaxsrError(f"unknown metric {unknown[0]!r}", expected=", ".join(METRICS))
+    if "all" in regions:
+        raise JaxsrError("a region is named 'all'", fix="choose another name: it is that of the whole image")
+    image_, truth_ = _checked(image, truth)
+    masks = {name: _sized_mask(mask, truth_.shape[:2]) for name, mask in regions.items()}
+    size = min(truth_.shape[:2])
+    found: dict[str, dict[str, float | None]] = {name: dict.fromkeys(keys) for name in ("all", *masks)}
+
+    def note(key: str, over: Callable[[np.ndarray | None], float], edge: int = 0) -> None:
+        found["all"][key] = over(None)
+        for name, mask in masks.items():
+            if mask[edge : mask.shape[0] - edge, edge : mask.shape[1] - edge].any():
+                found[name][key] = over(mask)
+
+    error = image_ - truth_
+    if "psnr" in keys:
+        note("psnr", lambda mask: _psnr_of(error, mask))
+    if "ssim" in keys and size >= SSIM_WINDOW:
+        ssim_map, edge = _channel_mean(_ssim_map(image_, truth_)), SSIM_WINDOW // 2
+        note("ssim", lambda mask: _average(ssim_map, mask, edge), edge)
+    if "lpips" in keys and size >= perceptual.MIN_SIZE["vgg"]:
+        params = perceptual.load_params("vgg")
+        # The map is made where it is asked for; the value of the whole image is not its mean.
+        if masks:
+            value, enlarged = (np.asarray(x) for x in _lpips_maps(image_, truth_, params))
+        else:
+            value, enlarged = np.asarray(_lpips_value(image_, truth_, params)), np.zeros(truth_.shape[:2])
+        note("lpips", lambda mask: float(value) if mask is None else _average(enlarged, mask))
+    if "flip" in keys:
+        errors = flip_map(image_, truth_) if flip_error is None else flip_error
+        note("flip", lambda mask: _average(errors, mask))
+    if "tpsnr" in keys and before is not None:
+        image_before, truth_before = _checked(*before)
+        change = _change(error, image_before - truth_before)
+        note("tpsnr", lambda mask: _psnr_of(change, mask))
+    return found
 
 
 def measure(
@@ -247,18 +363,26 @@ def measure(
     truths: Sequence[Image],
     starts: Sequence[bool] | None = None,
     flip_maps: Sequence[Float[np.ndarray, "h w"]] | None = None,
+    keys: Collection[str] | None = None,
 ) -> dict[str, list[float | None]]:
-    """Every metric of `METRICS`, by its key, for every frame.
+    """Every metric of `available`, by its key, for every frame.
 
-    Images smaller than the SSIM window have None for SSIM. `starts` is that of `temporal_psnr`; `flip_maps`
-    are those of `flip_map` at its default distance, if they were made already.
+    Images too small for SSIM or LPIPS have None there. `starts` is that of `temporal_psnr`; `flip_maps` are
+    those of `flip_map` at its default distance, if they were made already; `keys` are those of the metrics
+    that are wanted, if not all.
     """
-    tpsnr = temporal_psnr(images, truths, starts=starts)  # checks the lengths
+    _check_lengths(images, truths, starts)
     pairs = list(zip(images, truths, strict=True))
-    maps = [flip_map(a, b) for a, b in pairs] if flip_maps is None else flip_maps
-    return {
-        "psnr": [psnr(a, b) for a, b in pairs],
-        "ssim": [ssim(a, b) if min(b.shape[:2]) >= SSIM_WINDOW else None for a, b in pairs],
-        "flip": [float(m.mean(dtype=np.float64)) for m in maps],
-        "tpsnr": tpsnr,
-    }
+    found: dict[str, list[float | None]] = {key: [] for key in (available() if keys is None else keys)}
+    for t, (image, truth) in enumerate(pairs):
+        is_start = t == 0 or (starts is not None and starts[t])
+        values = measure_frame(
+            image,
+            truth,
+            before=None if is_start else pairs[t - 1],
+            flip_error=None if flip_maps is None else flip_maps[t],
+            keys=keys,
+        )["all"]
+        for key, value in values.items():
+            found[key].append(value)
+    return found

@@ -5,10 +5,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from flax import nnx
 
 from jaxsr.data import analytic
 from jaxsr.io.sequence import Sequence
+from jaxsr.io.weights import save_weights
 from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter
+from jaxsr.methods import build
 
 Layers = dict[str, np.ndarray]
 
@@ -70,3 +73,12 @@ def make_sequence(
             )
             out.write_frame(stated, images["hr"], {s: images[f"x{s}"] for s in scales})
     return Sequence.open(path)
+
+
+def random_weights(path: Path, *, scale: int, method: str = "fusion-sr", seed: int = 0) -> Path:
+    """A file of weights as training writes it, but of a network that has learned nothing."""
+    made = build(method, {})
+    assert made.new_net is not None
+    header = {"method": method, "arguments": dict(made.arguments), "scale": scale}
+    save_weights(path, nnx.state(made.new_net(nnx.Rngs(seed)), nnx.Not(nnx.RngState)), header)
+    return path

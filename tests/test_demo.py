@@ -68,7 +68,7 @@ def test_extrapolated_frames_are_marked(demo):
     assert sections[1].inputs[1] is None
 
 
-@pytest.mark.parametrize("name", sorted(n for n, m in METHODS.items() if m.new_net is None))
+@pytest.mark.parametrize("name", sorted(METHODS))
 def test_truth_is_never_seen(name, tmp_path):
     """HR colour, and LR colour of extrapolated frames, replaced by NaN: every output file stays the same."""
 
@@ -91,7 +91,7 @@ def test_truth_is_never_seen(name, tmp_path):
 
 def test_doubling_the_rate_of_full_size_frames(tmp_path):
     sequence = make_sequence(tmp_path / "seq", frames=4)
-    upscale(sequence, find_method("guided"), tmp_path / "out", scale=1, every=2)
+    upscale(sequence, find_method("guided", 1), tmp_path / "out", scale=1, every=2)
     channels, _ = read_exr(tmp_path / "out" / "exr" / "0003.exr")
     made = np.stack([channels[f"color.{c}"] for c in "RGB"], -1)
     np.testing.assert_allclose(made, sequence.truth(2), rtol=2e-3, atol=1e-4)  # half floats
@@ -113,16 +113,16 @@ def test_a_method_says_which_buffer_it_lacks(tmp_path):
 
     sequence = make_sequence(tmp_path / "seq", frames=2, spoil=strip)
     with pytest.raises(JaxsrError, match=r"'guided' needs hr.normal"):
-        upscale(sequence, find_method("guided"), tmp_path / "out", scale=2)
+        upscale(sequence, find_method("guided", 2), tmp_path / "out", scale=2)
     assert not (tmp_path / "out").exists()
     with pytest.raises(JaxsrError, match=r"unknown method 'magic'.*one of nearest"):
-        find_method("magic")
+        find_method("magic", 2)
 
 
 def test_frames_of_two_sequences_do_not_mix(tmp_path):
     long = make_sequence(tmp_path / "long", frames=4)
     short = make_sequence(tmp_path / "short", frames=2)
-    upscale(long, find_method("nearest"), tmp_path / "out", scale=2, keep=False)
+    upscale(long, find_method("nearest", 2), tmp_path / "out", scale=2)
     with pytest.raises(JaxsrError, match=r"holds 0003.exr, which is not a frame of this sequence"):
         upscale(short, find_method("nearest"), tmp_path / "out", scale=2)
 
@@ -133,7 +133,7 @@ def test_a_moving_camera_without_motion_is_an_error(tmp_path):
 
     sequence = make_sequence(tmp_path / "seq", frames=2, spoil=freeze)
     with pytest.raises(JaxsrError, match="motion is zero everywhere, yet the camera moves"):
-        upscale(sequence, find_method("taau"), tmp_path / "out", scale=2)
-    upscale(sequence, find_method("bilinear"), tmp_path / "a", scale=2)  # does without motion
+        upscale(sequence, find_method("taau", 2), tmp_path / "out", scale=2)
+    upscale(sequence, find_method("bilinear", 2), tmp_path / "a", scale=2)  # does without motion
     still = make_sequence(tmp_path / "still", frames=2, still=True, frozen=True)
-    upscale(still, find_method("taau"), tmp_path / "b", scale=2)  # nothing moves: zero is right
+    upscale(still, find_method("taau", 2), tmp_path / "b", scale=2)  # nothing moves: zero is right

@@ -18,23 +18,21 @@ from rich.console import Console
 
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation import embedding
+from jaxsr.evaluation.measuring import measured
 from jaxsr.evaluation.report import write_report
+from jaxsr.evaluation.sections import Section, Timing, Track
 from jaxsr.evaluation.tables import (
-    Section,
-    Timing,
-    Track,
     as_csv,
     as_json,
     best,
     markdown,
-    measured,
     rich_tables,
     summarise,
     summary,
     write_metrics,
 )
 from jaxsr.io.images import write_png
-from jaxsr.metrics import METRICS
+from jaxsr.metrics import available
 
 H, W, N = 16, 24, 4
 
@@ -329,7 +327,8 @@ def test_json_csv_markdown_and_terminal(made, tmp_path):
     assert rows[0]["tpsnr"] == ""
     assert float(rows[1]["flip"]) == made[0].tracks[0].metrics["flip"][1]
     mark = markdown(made)
-    assert mark.count("|---") == 4 * 7 - 3 * 2  # two timing columns only in the first table
+    columns = 1 + len(available()) + 2
+    assert mark.count("|---") == 4 * columns - 3 * 2  # two timing columns only in the first table
     close = summary(made[0].tracks[0], "psnr", range(N))
     assert f"| **{close.mean:.2f} ± {close.spread:.2f}** |" in mark
     console = Console(width=80, record=True, file=io.StringIO())
@@ -360,6 +359,8 @@ def test_the_viewer_runs_in_a_browser(page, tmp_path):
     assert re.search(r'<output id="frame-name"[^>]*>6 .*extrapolated', dom)
     assert re.search(r'aria-checked="true"[^>]*>Error<|data-value="error"[^>]*aria-checked="true"', dom)
     assert 'aria-valuetext="Truth 25 percent, Hold the rest"' in dom
-    visible = re.findall(r'<div class="result scroll" data-section="(\d)" data-subset="(\w+)">', dom)
+    visible = re.findall(
+        r'<div class="result scroll" data-section="(\d)" data-subset="(\w+)" data-region="all">', dom
+    )
     assert visible == [("1", "rendered")]
-    assert re.findall(r'<div class="chart" data-key="(\w+)">', dom) == list(METRICS)
+    assert re.findall(r'<div class="chart" data-key="(\w+)">', dom) == list(available())

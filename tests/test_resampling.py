@@ -194,6 +194,29 @@ def test_rearrangements_are_the_loops(size, scale, seed):
     np.testing.assert_array_equal(ops.depth_to_space(packed, scale), large)
 
 
+@given(size=st.sampled_from(SIZES), scale=st.sampled_from([1, 2, 3]), seed=st.integers(0, 10**6))
+def test_zero_upsample_follows_the_offset(size, scale, seed):
+    images = _random(seed, 2, *size, 2)
+    offset = np.random.default_rng(seed).integers(0, scale, (2, 2)).astype(np.int32)
+    result = ops.zero_upsample(images, scale, offset)
+    expected = [reference.zero_upsample(i, scale, o) for i, o in zip(images, offset, strict=True)]
+    np.testing.assert_array_equal(result, np.stack(expected))
+
+
+def test_zero_upsample_keeps_type_and_does_not_spread():
+    image = jnp.asarray([[[jnp.inf], [1.0]]], jnp.bfloat16)
+    spread = ops.zero_upsample(image, 2, jnp.array([1, 0]))
+    assert spread.dtype == jnp.bfloat16
+    np.testing.assert_array_equal(spread[..., 0].astype(jnp.float32), [[0, np.inf, 0, 1], [0, 0, 0, 0]])
+    assert not np.any(ops.zero_upsample(image, 2, jnp.array([2, 0])))  # beyond the block: nowhere
+
+
+def test_zero_upsample_gradient_is_the_adjoint():
+    image, weights, offset = _random(5, 3, 2, 1), _random(6, 9, 6, 1), jnp.array([2, 1])
+    gradient = jax.grad(lambda x: jnp.sum(ops.zero_upsample(x, 3, offset) * weights))(image)
+    np.testing.assert_array_equal(gradient, weights[1::3, 2::3])
+
+
 def test_space_to_depth_is_pytorch():
     np.testing.assert_array_equal(ops.space_to_depth(golden_ops.image(4, 6, 3), 2), GOLDEN["unshuffle"])
 
@@ -201,6 +224,7 @@ def test_space_to_depth_is_pytorch():
 def test_jit_and_batch():
     image, small = _random(7, 2, 4, 6, 4), _random(8, 2, 3, 3, 2)
     assert_jit_and_batch(lambda x: ops.zero_upsample(x, 2), image)
+    assert_jit_and_batch(lambda x, o: ops.zero_upsample(x, 3, o), image, np.array([[0, 2], [1, 1]], np.int32))
     assert_jit_and_batch(lambda x: ops.depth_to_space(ops.space_to_depth(x, 2), 2), image)
     assert_jit_and_batch(lambda x: ops.resize(x, (5, 5)), image)
     assert_jit_and_batch(lambda x: ops.upsample(x, 2), image)

@@ -14,19 +14,19 @@ import dataclasses
 import math
 import re
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.embedding import flip_jpeg
+from jaxsr.evaluation.measuring import Meter, Truth
 from jaxsr.evaluation.report import write_report
-from jaxsr.evaluation.tables import Section, Track, write_metrics
+from jaxsr.evaluation.sections import Section, Track
+from jaxsr.evaluation.tables import write_metrics
 from jaxsr.io.images import read_color, read_png, write_png
 from jaxsr.io.sequence import Sequence as FrameSequence
-from jaxsr.metrics import METRICS, flip_map, measure, temporal_psnr
 from jaxsr.ops.color import to_display
 
 Progress = Callable[[str, int], Callable[[], Any]]
@@ -176,6 +176,7 @@ def compare(
     title: str = "",
     meta: Mapping[str, Any] | None = None,
     max_megabytes: float = 18.0,
+    keys: Collection[str] | None = None,
     progress: Progress | None = None,
 ) -> Section:
     """Measure folders of frames against the truth; write report.html, metrics.json, .csv and .md into `out`.
@@ -189,6 +190,7 @@ def compare(
         fps: speed at which the page plays at first.
         meta: shown on the page and kept with the numbers.
         max_megabytes: aim for the size of the page.
+        keys: the metrics (`jaxsr.metrics.METRICS`); all there are by default.
         progress: for a progress bar.
 
     Returns:
@@ -225,7 +227,7 @@ def compare(
             frames=true.numbers or tuple(range(1, len(true.files) + 1)),
             truths=[shown.path("truth", file) for file in true.files],
             tracks=[
-                _measured(name, frames, true, starts, shown, advance)
+                _measured(name, frames, true, starts, shown, Meter(keys), advance)
                 for name, frames in zip(names, found, strict=True)
             ],
             exposure=exposure,
@@ -290,31 +292,27 @@ class _Shown(NamedTuple):
 
 
 def _measured(
-    name: str, frames: Frames, true: Frames, starts: Sequence[bool], shown: _Shown, advance: Callable[[], Any]
+    name: str,
+    frames: Frames,
+    true: Frames,
+    starts: Sequence[bool],
+    shown: _Shown,
+    meter: Meter,
+    advance: Callable[[], Any],
 ) -> Track:
     """All metrics of a folder, two frames in memory at a time."""
-    values: dict[str, list[float | None]] = {key: [] for key in METRICS}
-    maps: list[bytes] = []
-    before: tuple[np.ndarray, np.ndarray] | None = None
-    for i, (file, true_file) in enumerate(zip(frames.files, true.files, strict=True)):
+    size: tuple[int, ...] | None = None
+    for file, true_file, start in zip(frames.files, true.files, starts, strict=True):
         truth, image = shown.read("truth", true_file), shown.read(f"frames/{name}", file)
-        first = truth if before is None else before[1]
-        for array, path, size in ((truth, true_file, first.shape), (image, file, truth.shape)):
-            if array.shape != size:
+        size = size or truth.shape
+        for array, path, wanted in ((truth, true_file, size), (image, file, truth.shape)):
+            if array.shape != wanted:
                 raise JaxsrError(
                     "wrong size",
                     where=path,
-                    expected=f"{size[1]}x{size[0]}",
+                    expected=f"{wanted[1]}x{wanted[0]}",
                     found=f"{array.shape[1]}x{array.shape[0]}",
                 )
-        error = flip_map(image, truth)
-        found = measure([image], [truth], flip_maps=[error])
-        if before is not None:
-            pair = temporal_psnr([before[0], image], [before[1], truth], starts=[True, starts[i]])
-            found["tpsnr"] = pair[1:]
-        for key, one in found.items():
-            values[key] += one
-        maps.append(flip_jpeg(error))
-        before = (image, truth)
+        meter.add([image], [Truth(truth, {})], [start])
         advance()
-    return Track(name, [shown.path(f"frames/{name}", file) for file in frames.files], values, flip_maps=maps)
+    return meter.track(name, [shown.path(f"frames/{name}", file) for file in frames.files])

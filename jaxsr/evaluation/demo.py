@@ -2,21 +2,27 @@
 
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
 
 import jaxsr
+from jaxsr.evaluation.embedding import to_bytes
+from jaxsr.evaluation.measuring import Reference, metrics_with
 from jaxsr.evaluation.report import write_report
-from jaxsr.evaluation.tables import Section, write_metrics
-from jaxsr.evaluation.upscale import run_section
+from jaxsr.evaluation.run import find_method, shipped_scales
+from jaxsr.evaluation.sections import Section
+from jaxsr.evaluation.tables import write_metrics
+from jaxsr.evaluation.upscale import Settings, run_section
 from jaxsr.evaluation.video import write_video
 from jaxsr.io.sequence import Sequence as FrameSequence
 
 UPSCALERS = ("nearest", "bilinear", "bicubic", "taau", "guided-taau")
+LEARNED = "fusion-sr"
+"""Upscales too, where its weights ship for the scale."""
 EXTRAPOLATORS = ("nearest", "bilinear", "taau", "guided", "guided-taau")
 
 
@@ -38,27 +44,40 @@ def run_demo(
     sequences: Sequence[Path],
     *,
     scale: int,
+    lpips: Collection[str] = ("super-resolution",),
     progress: Callable[[str, int], Callable[[], Any]],
 ) -> list[Section]:
     """Run the demo and write frames, videos, metrics and the page into `out`.
 
     Args:
+        lpips: tasks in which LPIPS is measured where its extra is installed; it costs more than all the rest.
         progress: called with a title and a number of steps; returns what is called after each step.
 
     Raises:
         JaxsrError: a sequence cannot be read or lacks the scale.
     """
     opened = [FrameSequence.open(path) for path in sequences]
-    tasks = (("super-resolution", 1, UPSCALERS), ("extrapolation", 2, EXTRAPOLATORS))
-    total = sum(len(s) * len(methods) for s in opened for _, _, methods in tasks)
+    upscalers = (*UPSCALERS, LEARNED) if scale in shipped_scales(LEARNED) else UPSCALERS
+    rivals = ("taau", LEARNED) if LEARNED in upscalers else ("bilinear", "guided-taau")
+    tasks = (
+        _Task("super-resolution", 1, upscalers, rivals),
+        _Task("extrapolation", 2, EXTRAPOLATORS, ("taau", "guided-taau")),
+    )
+    total = sum(len(s) * len(task.methods) for s in opened for task in tasks)
     advance = progress("frames", 2 * total)  # made, and measured
     sections, compiled = [], dict[Any, float]()
     for sequence in opened:
-        for task, every, methods in tasks:
-            folder = out / sequence.name / task
+        reference = Reference(sequence)
+        for task in tasks:
             sections.append(
                 run_section(
-                    sequence, methods, folder, scale=scale, every=every, advance=advance, compiled=compiled
+                    sequence,
+                    [find_method(name, scale) for name in task.methods],
+                    out / sequence.name / task.name,
+                    Settings(scale, task.every, metrics=metrics_with(task.name in lpips)),
+                    reference=reference,
+                    advance=advance,
+                    compiled=compiled,
                 )
             )
     meta = description(scale=scale)
@@ -67,38 +86,45 @@ def run_demo(
     write_metrics(out, sections, title="jaxsr demo", meta=meta)
     advance()
     advance = progress("videos", len(sections))
-    names = [
-        (s, task, rival)
-        for s in opened
-        for task, rival in (("super-resolution", "bilinear"), ("extrapolation", "taau"))
-    ]
-    for section, (sequence, task, rival) in zip(sections, names, strict=True):
-        _write_video(out / f"{sequence.name}-{task}.mp4", section, (rival, "guided-taau"), sequence.fps / 3)
+    shown = [(sequence, task) for sequence in opened for task in tasks]
+    for section, (sequence, task) in zip(sections, shown, strict=True):
+        path = out / f"{sequence.name}-{task.name}.mp4"
+        _write_video(path, section, task.shown, sequence.fps / 3)
         advance()
     return sections
+
+
+class _Task(NamedTuple):
+    """What the demo does with every sequence."""
+
+    name: str
+    every: int
+    methods: tuple[str, ...]
+    shown: tuple[str, str]
+    """Of these, the two in the video."""
 
 
 def _write_video(path: Path, section: Section, names: Sequence[str], fps: float) -> None:
     """Input, two methods and truth, two by two; the clip is short and plays four times."""
     tracks = {t.name: t.images for t in section.tracks}
-    shown = {"input": _enlarged(section), **{n: tracks[n] for n in names}, "truth": section.truths}
+    shown = {"input": enlarged(section), **{n: tracks[n] for n in names}, "truth": section.truths}
     extrapolated = section.extrapolated or [False] * len(section.frames)
     captions = [
         f"frame {n}{', extrapolated' if e else ''}" for n, e in zip(section.frames, extrapolated, strict=True)
     ]
-    columns = {label: [np.asarray(image) for image in images] * 4 for label, images in shown.items()}
+    columns = {label: list(images) * 4 for label, images in shown.items()}
     write_video(path, columns, fps=fps, per_row=2, captions=captions * 4)
 
 
-def _enlarged(section: Section) -> list[np.ndarray]:
+def enlarged(section: Section) -> list[np.ndarray]:
     """The inputs at the size of the truth by pixel repetition; the last one stays where none was rendered."""
-    height = np.asarray(section.truths[0]).shape[0]
+    height = to_bytes(section.truths[0]).shape[0]
     images: list[np.ndarray] = []
     for given in section.inputs:
         if given is None:
             images.append(images[-1])
             continue
-        pixels = np.asarray(given)
+        pixels = to_bytes(given)
         factor = height // pixels.shape[0]
         images.append(pixels.repeat(factor, 0).repeat(factor, 1))
     return images

@@ -14,7 +14,7 @@
   const SCALES = [0.02, 0.05, 0.1, 0.2, 0.5, 1];
   const ZOOMS = [1, 2, 3, 4, 6, 8];
   const FPS = [...new Set([1, 2, 4, 8, 12, 24, 30, 60, data.fps])].sort((a, b) => a - b);
-  const state = { section: 0, frame: 0, left: "", right: "", view: "image", scale: 0.2, zoom: 0, x: 0.5, y: 0.5, split: 0.5, subset: "", fps: data.fps };
+  const state = { section: 0, frame: 0, left: "", right: "", view: "image", scale: 0.2, zoom: 0, x: 0.5, y: 0.5, split: 0.5, subset: "", region: "all", fps: data.fps };
   let playing = 0, pointer = null, queued = false, hover = null;
 
   // Sources: what can be put on a side. Every section has the truth, perhaps the input, and its tracks.
@@ -29,6 +29,9 @@
     s.hasFlip = s.tracks.some((t) => t.flip);
   }
   const section = () => data.sections[state.section];
+  // The metrics of a source on the chosen pixels: every value is a list over the frames.
+  const metricsOf = (t) => (state.region === "all" ? t.metrics : t.regions?.[state.region]);
+  const metricKeys = () => Object.keys(data.metrics).filter((k) => section().tracks.some((t) => metricsOf(t)?.[k]));
   const source = (key) => section().sources.find((s) => s.key === key);
   const frames = () => section().frames.length;
   document.documentElement.classList.add("js");
@@ -174,7 +177,8 @@
   // ---- text around the stage
   const show = (v, key) => (v == null ? "–" : v === "inf" ? "∞" : v.toFixed(data.metrics[key].digits));
   function chip(element, src) {
-    const values = src.metrics ? ["psnr", "flip"].filter((k) => src.metrics[k]).map((k) => `${data.metrics[k].label} ${show(src.metrics[k][state.frame], k)}`).join(" · ") : "";
+    const m = metricsOf(src) || {};
+    const values = ["psnr", "flip"].filter((k) => m[k]).map((k) => `${data.metrics[k].label} ${show(m[k][state.frame], k)}`).join(" · ");
     element.innerHTML = `<span>${escape(src.name)}</span>${values ? `<small>${values}</small>` : ""}`;
   }
   function probe() {
@@ -217,7 +221,7 @@
 
   // ---- charts
   function ticks(low, high) {
-    const raw = (high - low) / 3 || 1, power = 10 ** Math.floor(Math.log10(raw)), step = power * [1, 2, 5, 10].find((m) => m * power >= raw);
+    const raw = (high - low) / 4 || 1, power = 10 ** Math.floor(Math.log10(raw)), step = power * [1, 2, 5, 10].find((m) => m * power >= raw);
     const out = [];
     for (let v = Math.ceil(low / step) * step; v <= high + 1e-9 * step; v += step) out.push(v);
     return [out, Math.max(0, -Math.floor(Math.log10(step) + 1e-9))];
@@ -225,7 +229,7 @@
   const CHART = { left: 44, right: 8, top: 8, bottom: 17, height: 130 };
   // As many charts in a row as there are metrics, if each gets 250 pixels.
   function chartWidth() {
-    const room = $("charts").clientWidth || 350, s = section(), count = Object.keys(data.metrics).filter((k) => s.tracks.some((t) => t.metrics[k])).length || 1;
+    const room = $("charts").clientWidth || 350, count = metricKeys().length || 1;
     const fit = clamp(Math.floor((room + 24) / 274), 1, count), columns = count === 4 && fit === 3 ? 2 : fit;
     $("charts").style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
     return (room - 24 * (columns - 1)) / columns;
@@ -236,9 +240,9 @@
     const half = (width - CHART.left - CHART.right) / n / 2;
     let html = "";
     for (const key of Object.keys(data.metrics)) {
-      const having = s.sources.filter((t) => t.metrics && t.metrics[key] && t.metrics[key].some((v) => v != null));
+      const having = s.sources.filter((t) => metricsOf(t)?.[key]?.some((v) => v != null));
       if (!having.length) continue;
-      const finite = having.flatMap((t) => t.metrics[key]).filter((v) => typeof v === "number");
+      const finite = having.flatMap((t) => metricsOf(t)[key]).filter((v) => typeof v === "number");
       let low = finite.length ? Math.min(...finite) : 0, high = finite.length ? Math.max(...finite) : 1;
       const pad = (high - low) * 0.08 || Math.abs(high) * 0.05 || 0.5;
       low -= pad; high += pad;
@@ -253,7 +257,7 @@
       svg += `<line class="now" y1="${CHART.top}" y2="${bottom}"/><line class="hover" y1="${CHART.top}" y2="${bottom}" visibility="hidden"/>`;
       for (const t of having) {
         let path = "", dots = "", pen = "M";
-        t.metrics[key].forEach((v, i) => {
+        metricsOf(t)[key].forEach((v, i) => {
           if (v === "inf") dots += `<text class="inf" x="${xOf(i)}" y="${CHART.top + 6}" text-anchor="middle">∞</text>`;
           if (typeof v !== "number") { pen = "M"; return; }
           path += `${pen}${xOf(i).toFixed(1)} ${yOf(v).toFixed(1)}`; pen = "L";
@@ -292,9 +296,9 @@
     if (!hover) return;
     const [i, key, px, py] = hover, s = section(), sign = data.metrics[key].higher_is_better ? -1 : 1;
     const rank = (v) => (v === "inf" ? Infinity : v == null ? -sign * Infinity * -1 : v);
-    const list = s.sources.filter((t) => t.metrics && t.metrics[key]).sort((a, b) => (sign * (rank(a.metrics[key][i]) - rank(b.metrics[key][i]))) || 0);
+    const list = s.sources.filter((t) => metricsOf(t)?.[key]).sort((a, b) => (sign * (rank(metricsOf(a)[key][i]) - rank(metricsOf(b)[key][i]))) || 0);
     tip.innerHTML = `<div class="head">${escape(data.metrics[key].label)}, frame ${s.frames[i]}${s.extrapolated[i] ? ", extrapolated" : ""}</div>` +
-      list.map((t) => `<div><span><i class="swatch" style="--c:${t.color}"></i>${escape(t.name)}</span><b>${show(t.metrics[key][i], key)}</b></div>`).join("");
+      list.map((t) => `<div><span><i class="swatch" style="--c:${t.color}"></i>${escape(t.name)}</span><b>${show(metricsOf(t)[key][i], key)}</b></div>`).join("");
     const r = tip.getBoundingClientRect();
     tip.style.left = `${px + 16 + r.width > innerWidth ? px - r.width - 16 : px + 16}px`;
     tip.style.top = `${clamp(py - r.height / 2, 6, innerHeight - r.height - 6)}px`;
@@ -302,12 +306,12 @@
 
   // ---- building and updating
   function numbers() {
-    const s = section(), keys = Object.keys(data.metrics).filter((k) => s.tracks.some((t) => t.metrics[k]));
+    const s = section(), keys = metricKeys();
     let html = "";
     for (const key of keys) {
       const m = data.metrics[key];
       html += `<table class="data"><thead><tr><th scope="col">${escape(m.label)}${m.unit ? ` [${escape(m.unit)}]` : ""}</th>${s.frames.map((f, i) => `<th scope="col">${f}${s.extrapolated[i] ? " ✕" : ""}</th>`).join("")}</tr></thead><tbody>` +
-        s.tracks.filter((t) => t.metrics[key]).map((t) => `<tr><th scope="row">${escape(t.name)}</th>${t.metrics[key].map((v) => `<td>${show(v, key)}</td>`).join("")}</tr>`).join("") + "</tbody></table>";
+        s.tracks.filter((t) => metricsOf(t)?.[key]).map((t) => `<tr><th scope="row">${escape(t.name)}</th>${metricsOf(t)[key].map((v) => `<td>${show(v, key)}</td>`).join("")}</tr>`).join("") + "</tbody></table>";
     }
     $("numbers-body").innerHTML = html + (s.extrapolated.some(Boolean) ? '<p class="fine">✕: extrapolated frame.</p>' : "");
   }
@@ -328,16 +332,20 @@
     $("sources").innerHTML = `<thead><tr><th scope="col">Compare</th><th scope="col">Left</th><th scope="col">Right</th>${s.columns.map((k) => `<th scope="col" class="n">${escape(data.metrics[k].label)}</th>`).join("")}</tr></thead><tbody>` + s.sources.map((t) =>
       `<tr data-key="${escape(t.key)}"><td title="${escape(t.note || "")}"><div><span class="swatch ${t.metrics ? "" : "none"}" style="--c:${t.color}"></span><span>${escape(t.name)}${t.note && !t.metrics ? `<small>${escape(t.note)}</small>` : ""}</span></div></td>` +
       ["left", "right"].map((side) => `<td><input type="radio" name="${side}" value="${escape(t.key)}" aria-label="${escape(t.name)} on the ${side}"></td>`).join("") + s.columns.map(() => '<td class="n"></td>').join("") + "</tr>").join("") + "</tbody>";
-    for (const el of document.querySelectorAll(".result")) {
-      const colors = data.sections[+el.dataset.section].sources.filter((t) => t.metrics).map((t) => t.color);
-      el.querySelectorAll("tbody tr").forEach((row, i) => {
-        if (!row.querySelector(".swatch")) row.firstElementChild.insertAdjacentHTML("afterbegin", `<span class="swatch" style="--c:${colors[i]}"></span>`);
-      });
+    for (const head of document.querySelectorAll(".result tbody th")) {
+      const i = methods.indexOf(head.dataset.name);
+      if (!head.querySelector(".swatch")) head.insertAdjacentHTML("afterbegin", `<span class="swatch" style="--c:var(--t${i % 10})"></span>`);
     }
     const subsets = s.subsets.map(([name, count]) => [name, `${name[0].toUpperCase()}${name.slice(1)} (${count})`]);
     if (!s.subsets.some(([name]) => name === state.subset)) state.subset = s.subsets[0][0];
     buttons($("subsets"), subsets, state.subset, (v) => { state.subset = v; update(); });
     $("subsets").hidden = subsets.length < 2;
+    const regions = s.regions.map((name) => [name, name === "all" ? "All pixels" : `${name[0].toUpperCase()}${name.slice(1)}`]);
+    if (!s.regions.includes(state.region)) state.region = "all";
+    for (const element of document.querySelectorAll(".regions")) {
+      buttons(element, regions, state.region, (v) => { state.region = v; numbers(); charts(); update(); });
+      element.hidden = regions.length < 2;
+    }
     $("results-title").textContent = "Results";
     $("results-facts").textContent = `${s.title} · ${n(frames(), "frame")} of ${s.size[0]}×${s.size[1]}`;
     $("numbers").hidden = false;
@@ -352,9 +360,10 @@
     for (const side of ["left", "right"]) for (const input of document.querySelectorAll(`input[name="${side}"]`)) input.checked = input.value === state[side];
     for (const row of $("sources").querySelectorAll("tbody tr")) {
       const t = source(row.dataset.key);
-      row.querySelectorAll("td.n").forEach((td, i) => { td.textContent = t.metrics?.[s.columns[i]] ? show(t.metrics[s.columns[i]][state.frame], s.columns[i]) : ""; });
+      row.querySelectorAll("td.n").forEach((td, i) => { const values = metricsOf(t)?.[s.columns[i]]; td.textContent = values ? show(values[state.frame], s.columns[i]) : ""; });
     }
-    $("sources-frame").textContent = `PSNR and FLIP of frame ${s.frames[state.frame]}`;
+    $("sources-frame").textContent = `PSNR and FLIP of frame ${s.frames[state.frame]}${state.region === "all" ? "" : `, ${state.region} alone`}`;
+    for (const element of document.querySelectorAll(".regions")) mark(element, state.region);
     mark($("views"), state.view); mark($("subsets"), state.subset); mark($("zooms"), state.zoom);
     $("scale-box").hidden = state.view === "image"; $("legend").hidden = state.view === "image";
     $("scale").value = state.scale; $("fps").value = state.fps;
@@ -364,7 +373,14 @@
     $("scrub").setAttribute("aria-valuetext", `frame ${s.frames[state.frame]}${s.extrapolated[state.frame] ? ", extrapolated" : ""}`);
     $("frame-name").innerHTML = `${s.frames[state.frame]} <span style="color:var(--muted)">of ${s.frames[frames() - 1]}</span>${s.extrapolated[state.frame] ? " <em>extrapolated</em>" : ""}`;
     [...$("ticks").children].forEach((t, i) => t.classList.toggle("on", i === state.frame));
-    for (const el of document.querySelectorAll(".result")) el.hidden = +el.dataset.section !== state.section || el.dataset.subset !== state.subset;
+    let means = 0;
+    for (const el of document.querySelectorAll(".result")) {
+      const here = el.dataset.task === undefined ? +el.dataset.section === state.section : el.dataset.task === s.task;
+      el.hidden = !here || el.dataset.subset !== state.subset || el.dataset.region !== state.region;
+      if (!el.hidden && el.dataset.task !== undefined) means += 1;
+    }
+    $("means-title").hidden = !means;
+    $("means-title").textContent = `Mean over ${n(data.sections.filter((t) => t.task === s.task).length, "sequence")} · ${s.task}`;
     handle.setAttribute("aria-valuenow", Math.round(100 * state.split));
     handle.setAttribute("aria-valuetext", `${src.left.name} ${Math.round(100 * state.split)} percent, ${src.right.name} the rest`);
     $("play").innerHTML = playing ? '<svg viewBox="0 0 16 16" aria-hidden="true"><path d="M4 3h3v10H4zM9 3h3v10H9z"/></svg>' : '<svg viewBox="0 0 16 16" aria-hidden="true"><path d="M4 2.5 13 8l-9 5.5z"/></svg>';
@@ -379,6 +395,7 @@
     if (state.zoom) { p.set("zoom", state.zoom); p.set("x", state.x.toFixed(4)); p.set("y", state.y.toFixed(4)); }
     if (Math.abs(state.split - 0.5) > 1e-3) p.set("split", state.split.toFixed(3));
     if (section().subsets.length > 1) p.set("subset", state.subset);
+    if (state.region !== "all") p.set("region", state.region);
     return p.toString();
   }
   function defaults() {
@@ -409,6 +426,7 @@
     if (SCALES.includes(num("scale", 0, 1))) state.scale = num("scale", 0, 1);
     state.zoom = num("zoom", 0, 8) ?? 0; state.x = num("x", 0, 1) ?? 0.5; state.y = num("y", 0, 1) ?? 0.5; state.split = num("split", 0, 1) ?? 0.5;
     if (section().subsets.some(([name]) => name === p.get("subset"))) state.subset = p.get("subset");
+    state.region = section().regions.includes(p.get("region")) ? p.get("region") : "all";
     build();
   }
 

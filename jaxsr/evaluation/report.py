@@ -4,7 +4,7 @@ Images are embedded at the best quality that keeps the page below a size (`embed
 which that is and how large the error of the encoding is. Metrics on the page were measured before encoding;
 error maps are computed in the browser from the embedded images.
 
-The numbers of a section are also in plain HTML tables, readable without JavaScript.
+The numbers are also in plain HTML tables, readable without JavaScript.
 """
 
 import base64
@@ -22,7 +22,9 @@ from matplotlib import colormaps
 
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.embedding import Images, thinned
-from jaxsr.evaluation.tables import Section, json_value, rows
+from jaxsr.evaluation.regions import REGIONS
+from jaxsr.evaluation.sections import Section
+from jaxsr.evaluation.tables import Scores, groups, json_value, mean_scores, rows, scores
 from jaxsr.io.exr import atomic_path
 from jaxsr.metrics import METRICS
 
@@ -68,6 +70,7 @@ def _section_data(section: Section, images: Images) -> dict[str, Any]:
                 "images": indices,
                 "flip": list(track.flip_maps),
                 "metrics": track.metrics,
+                "regions": track.regions,
             }
         )
     inputs = [
@@ -88,37 +91,54 @@ def _section_data(section: Section, images: Images) -> dict[str, Any]:
         "input_note": note,
         "tracks": tracks,
         "subsets": [[name, len(where)] for name, where in section.subsets().items()],
+        "regions": section.regions(),
+        "task": section.task,
     }
 
 
 def _tables(sections: Sequence[Section]) -> str:
-    """Every section and subset as an HTML table; the viewer shows one of them at a time."""
-    out = []
-    for index, section in enumerate(sections):
-        for subset, positions in section.subsets().items():
-            columns, cells, marks = rows(section, subset)
-            timing = len(columns) - 2 if any(t.timing for t in section.tracks) else len(columns)
-            head = "".join(
-                f'<th scope="col"{" class=time" if i == timing else ""}>{html.escape(c)}</th>'
-                for i, c in enumerate(columns)
-            )
-            body = []
-            for track, line, mark in zip(section.tracks, cells, marks, strict=True):
-                note = f"<small>{html.escape(track.note)}</small>" if track.note else ""
-                row = [f'<th scope="row">{html.escape(track.name)}{note}</th>']
-                for i, (text, best) in enumerate(zip(line[1:], mark[1:], strict=True), 1):
-                    value, _, rest = html.escape(text).partition(" ")
-                    value = f'<b class="best">{value}<span class="vh"> (best)</span></b>' if best else value
-                    rest = f" <span>{rest}</span>" if rest else ""
-                    row.append(f"<td{' class=time' if i == timing else ''}>{value}{rest}</td>")
-                body.append("<tr>" + "".join(row) + "</tr>")
-            count = f"{len(positions)} frame{'s' if len(positions) != 1 else ''}"
-            out.append(
-                f'<div class="result scroll" data-section="{index}" data-subset="{html.escape(subset)}">'
-                f'<table class="data"><caption>{html.escape(section.title)} · {subset}: {count}</caption>'
-                f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
-            )
-    return "\n".join(out)
+    """Every section, subset and region as an HTML table; the viewer shows one of them at a time."""
+    return "\n".join(
+        _table(scores(section, subset, region), f'data-section="{index}"')
+        for index, section in enumerate(sections)
+        for subset in section.subsets()
+        for region in section.regions()
+    )
+
+
+def _means(sections: Sequence[Section]) -> str:
+    """The means over the sections of a task, for each subset and region."""
+    return "\n".join(
+        _table(mean_scores(task, same, subset, region), f'data-task="{html.escape(task)}"')
+        for task, same in groups(sections).items()
+        for subset in same[0].subsets()
+        for region in same[0].regions()
+    )
+
+
+def _table(table: Scores, place: str) -> str:
+    columns, cells, marks = rows(table)
+    first = 1 + len(table.keys)  # of the columns that are no metrics
+    head = "".join(
+        f'<th scope="col"{" class=time" if i == first else ""}>{html.escape(c)}</th>'
+        for i, c in enumerate(columns)
+    )
+    body = []
+    for one, line, mark in zip(table.lines, cells, marks, strict=True):
+        note = f"<small>{html.escape(one.note)}</small>" if one.note else ""
+        row = [f'<th scope="row" data-name="{html.escape(one.name)}">{html.escape(one.name)}{note}</th>']
+        for i, (text, best) in enumerate(zip(line[1:], mark[1:], strict=True), 1):
+            value, _, rest = html.escape(text).partition(" ")
+            value = f'<b class="best">{value}<span class="vh"> (best)</span></b>' if best else value
+            rest = f" <span>{rest}</span>" if rest else ""
+            row.append(f"<td{' class=time' if i == first else ''}>{value}{rest}</td>")
+        body.append("<tr>" + "".join(row) + "</tr>")
+    return (
+        f'<div class="result scroll" {place} data-subset="{html.escape(table.subset)}" '
+        f'data-region="{html.escape(table.region)}">'
+        f'<table class="data"><caption>{html.escape(table.title)} · {html.escape(table.about)}</caption>'
+        f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table></div>"
+    )
 
 
 def _list(pairs: Iterable[tuple[str, object]]) -> str:
@@ -237,19 +257,24 @@ def write_report(
         ("Exposure", ", ".join(f"{e:g}" for e in exposures)),
         ("Crop", "none: all pixels count, borders included"),
         *((METRICS[k].label, METRICS[k].definition) for k in keys),
+        *((r.capitalize(), REGIONS[r]) for r in REGIONS if any(r in s.regions() for s in sections)),
         ("Embedded as", about),
         (
             "Error maps",
             "|difference|: from the embedded images; FLIP: from the originals, stored as grey JPEG",
         ),
     ]
-    section_meta = [(f"{s.title} · {k}", v) for s in sections for k, v in _flat(s.meta)]
+    known = dict(_flat(meta or {}))
+    section_meta = [
+        (f"{s.title} · {k}", v) for s in sections for k, v in _flat(s.meta) if k not in known or known[k] != v
+    ]
     package = resources.files("jaxsr.evaluation")
     parts = {
         "TITLE": html.escape(title),
         "CSS": package.joinpath("report.css").read_text("utf-8").strip(),
         "JS": package.joinpath("report.js").read_text("utf-8").strip(),
         "TABLES": _tables(sections),
+        "MEANS": _means(sections),
         "META": _list([*_flat(meta or {}), *section_meta]),
         "DEFINITIONS": _list(definitions),
         # "</script>" or "<!--" inside a string would end or change the script element.

@@ -1,21 +1,41 @@
 """A method over a sequence, frame by frame in constant memory, with the compilation timed apart.
 
-`stream` feeds any iterable of frames to a method's step. What a frame holds is decided here: `observed` reads
-a sequence so that the truth, and the colour of frames that are to be extrapolated, are never handed over.
+`find_method` gets a method ready, with the weights of its network where it has one. `stream` feeds any
+iterable of frames to its step. What a frame holds is decided here: `observed` reads a sequence so that the
+truth, and the colour of frames that are to be extrapolated, are never handed over.
 """
 
+import importlib.resources
+import re
 import time
 from collections.abc import Iterable, Iterator
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax import nnx
 
+import jaxsr
 from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.cost import Cost, count_parameters, multiply_adds_of
 from jaxsr.frames import Frame
 from jaxsr.io.sequence import Sequence, prefetch
-from jaxsr.methods import METHODS, Method
+from jaxsr.io.weights import into, load_weights
+from jaxsr.methods import METHODS, Method, build
+from jaxsr.methods._method import Net
+
+
+class Ready(NamedTuple):
+    """A method with all it needs to run."""
+
+    method: Method
+    """Named as it was asked for: a file of weights gives its own name."""
+    net: Net = None
+    """Of a network, its state; None where nothing is learned."""
+    weights: Path | None = None
+    """The file that the state was read from."""
 
 
 class Output(NamedTuple):
@@ -27,17 +47,74 @@ class Output(NamedTuple):
     """Time of the step alone: inputs on the device, compiled."""
     compile_seconds: float
     """Time spent compiling before this step; zero for all but the first frame of a size."""
+    cost: Cost
+    """Of the step: the same for all frames."""
 
 
-def find_method(name: str) -> Method:
-    """The method of that name.
+def weights_folder() -> Path:
+    """The folder of the weights that ship with the package."""
+    return Path(str(importlib.resources.files(jaxsr) / "weights"))
+
+
+def shipped_scales(name: str) -> list[int]:
+    """Scales for which weights of that name ship with the package."""
+    found = (
+        re.fullmatch(rf"{re.escape(name)}-x(\d+)", path.stem)
+        for path in weights_folder().glob("*.safetensors")
+    )
+    return sorted(int(match[1]) for match in found if match)
+
+
+def find_method(name: str, scale: int) -> Ready:
+    """The method of that name, or of a file of weights.
+
+    Args:
+        name: of a method; or of weights that ship with the package for some scales, for instance "fusion-sr";
+            or the path of a file that ends in ".safetensors", whose header names the method.
+        scale: HR size over LR size; weights must be made for it.
 
     Raises:
-        JaxsrError: there is none.
+        JaxsrError: there is none, no weights of it ship for this scale, or the file is damaged, of another
+            scale, or does not fit the method.
     """
-    if name not in METHODS:
-        raise JaxsrError(f"unknown method {name!r}", expected="one of " + ", ".join(METHODS))
-    return METHODS[name]
+    if name.endswith(".safetensors"):
+        path = Path(name)
+        return _with_weights(path.stem, path, scale)
+    scales = shipped_scales(name)
+    if scale in scales:
+        return _with_weights(name, weights_folder() / f"{name}-x{scale}.safetensors", scale)
+    if name not in METHODS and not scales:
+        raise JaxsrError(
+            f"unknown method {name!r}",
+            expected="one of " + ", ".join(METHODS),
+            fix="or the path of a file of weights, *.safetensors",
+        )
+    if scales or METHODS[name].new_net is not None:
+        raise JaxsrError(
+            f"no weights of {name!r} for scale {scale}",
+            expected=f"scale {' or '.join(map(str, scales))}" if scales else None,
+            found=None if scales else "no weights of it in the package",
+            fix="train some (jaxsr train) and give the path of the file as the method",
+        )
+    return Ready(METHODS[name])
+
+
+def _with_weights(name: str, path: Path, scale: int) -> Ready:
+    arrays, header = load_weights(path)
+    trained = header.get("scale")
+    if trained != scale:
+        raise JaxsrError(
+            "the weights are made for another scale",
+            where=path,
+            expected=f"scale {scale}",
+            found=f"scale {trained}",
+            fix=f"choose --scale {trained}, or other weights",
+        )
+    method = build(header.get("method", ""), header.get("arguments", {}))
+    assert method.new_net is not None  # `build` knows only methods that learn
+    new_net = method.new_net
+    empty = nnx.state(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))))
+    return Ready(method._replace(name=name), into(empty, arrays, path), path)
 
 
 def rendered_schedule(sequence: Sequence, every: int) -> list[bool]:
@@ -97,13 +174,17 @@ def _layer(field: str) -> str:
     return field.removesuffix("_linear").removesuffix("_px")
 
 
-def stream(method: Method, frames: Iterable[Frame], net: Any = None) -> Iterator[Output]:
+def stream(method: Method, frames: Iterable[Frame], net: Net = None) -> Iterator[Output]:
     """Run a method over frames.
+
+    Args:
+        net: state of its network, None where it has none.
 
     Raises:
         JaxsrError: a frame has another size than the first, or the first is not rendered.
     """
-    step, state, shape, compile_seconds = None, None, None, 0.0
+    step, state, shape, cost, compile_seconds = None, None, None, Cost(0, 0.0), 0.0
+    net = jax.device_put(net)
     for number, host_frame in enumerate(frames):
         if number == 0:
             if not bool(host_frame.rendered):
@@ -115,13 +196,16 @@ def stream(method: Method, frames: Iterable[Frame], net: Any = None) -> Iterator
             shape = jax.tree.map(np.shape, frame)
             state = jax.jit(method.init)(frame)
             start = time.perf_counter()
-            step = jax.jit(method.step).lower(net, state, frame).compile()
+            traced = jax.jit(method.step).trace(net, state, frame)
+            step = traced.lower().compile()
             compile_seconds = time.perf_counter() - start
+            pixels = int(np.prod(frame.hr.depth_linear.shape))
+            cost = Cost(count_parameters(net), multiply_adds_of(traced.jaxpr.jaxpr) / pixels)
         elif jax.tree.map(np.shape, frame) != shape:
             raise JaxsrError("the size or the buffers change within the sequence", where=f"frame {number}")
         jax.block_until_ready((state, frame))
         start = time.perf_counter()
         state, image = jax.block_until_ready(step(net, state, frame))
         seconds = time.perf_counter() - start
-        yield Output(np.asarray(image), seconds, compile_seconds)
+        yield Output(np.asarray(image), seconds, compile_seconds, cost)
         compile_seconds = 0.0

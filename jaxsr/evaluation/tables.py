@@ -1,12 +1,9 @@
-"""Results as small values, and as a table, Markdown, JSON and CSV.
-
-A `Section` is one sequence and task, a `Track` one method's frames in it. Images are display-referred, in
-[0, 1], `[H, W, 3]`, or the path of a PNG that holds them. Metrics are lists with one value a frame, named as
-in `jaxsr.metrics.METRICS`; None where a value is not defined and `inf` for the PSNR of identical images.
+"""Results as a table, Markdown, JSON and CSV.
 
 A mean runs over the finite values of the frames. Identical frames (infinite PSNR) are left out of it and
 counted beside it; were they all identical, the mean is infinite. Spread is the standard deviation over the
-frames (of the population, 0 for one frame): how much frames differ, not an uncertainty of the mean.
+frames (of the population, 0 for one frame): how much frames differ, not an uncertainty of the mean. Sections
+of one task are averaged once more: each counts the same however long it is, and the spread is over sections.
 
 JSON has no infinity: it is written as the string "inf". None is null.
 """
@@ -15,11 +12,10 @@ import csv
 import io
 import json
 import math
-from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from rich.box import SIMPLE_HEAD
@@ -27,97 +23,10 @@ from rich.markup import escape
 from rich.table import Table
 
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.embedding import ImageOrPath, flip_jpeg
+from jaxsr.evaluation.cost import Cost
+from jaxsr.evaluation.sections import ALL, Section, Timing, Track, Values
 from jaxsr.io.exr import atomic_path
-from jaxsr.metrics import METRICS, flip_map, measure
-
-Values: TypeAlias = Sequence[float | None]
-
-
-@dataclass(frozen=True)
-class Timing:
-    """Time of one frame. Compilation happens once and is never part of the median."""
-
-    compile_s: float
-    """Seconds of compilation alone, before the first call."""
-    median_ms: float
-    """Median time of one frame in milliseconds."""
-    spread_ms: float
-    """Interquartile range of the time of one frame in milliseconds."""
-
-
-@dataclass(frozen=True)
-class Track:
-    """One method on one sequence and task."""
-
-    name: str
-    images: Sequence[ImageOrPath]
-    metrics: Mapping[str, Values]
-    timing: Timing | None = None
-    note: str = ""
-    flip_maps: Sequence[bytes] = ()
-    """FLIP error maps for the page as grey JPEG (`flip_jpeg`), one a frame; empty if they are not wanted."""
-
-
-@dataclass(frozen=True)
-class Section:
-    """One sequence and task, for instance "bunker, x4, every second frame extrapolated"."""
-
-    title: str
-    frames: Sequence[int]
-    """Numbers of the frames, as files and people name them."""
-    truths: Sequence[ImageOrPath]
-    tracks: Sequence[Track]
-    inputs: Sequence[ImageOrPath | None] = ()
-    """What the methods were given, at its own size; None for a frame that was not rendered."""
-    extrapolated: Sequence[bool] = ()
-    """True for frames that no method saw rendered; empty if there are none."""
-    exposure: float = 1.0
-    meta: Mapping[str, Any] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        n = len(self.frames)
-        if n == 0:
-            raise JaxsrError("no frames", where=self.title)
-        if not self.tracks:
-            raise JaxsrError("no tracks", where=self.title)
-        names = [t.name for t in self.tracks]
-        if len(set(names)) != len(names):
-            raise JaxsrError("two tracks have the same name", where=self.title, found=names)
-        counts = {"truths": len(self.truths)}
-        counts |= {"inputs": len(self.inputs)} if self.inputs else {}
-        counts |= {"extrapolated": len(self.extrapolated)} if self.extrapolated else {}
-        for track in self.tracks:
-            counts[f"images of {track.name}"] = len(track.images)
-            counts |= {f"{key} of {track.name}": len(v) for key, v in track.metrics.items()}
-            counts |= {f"FLIP maps of {track.name}": len(track.flip_maps)} if track.flip_maps else {}
-            for key in track.metrics:
-                if key not in METRICS:
-                    raise JaxsrError(
-                        f"unknown metric '{key}'",
-                        where=f"{self.title}, {track.name}",
-                        expected=sorted(METRICS),
-                    )
-        for what, count in counts.items():
-            if count != n:
-                raise JaxsrError(
-                    f"{what}: wrong number", where=self.title, expected=f"{n} (frames)", found=count
-                )
-
-    def metric_keys(self) -> list[str]:
-        """Keys of the metrics that any track has, in the order of `METRICS`."""
-        return [key for key in METRICS if any(key in track.metrics for track in self.tracks)]
-
-    def subsets(self) -> dict[str, list[int]]:
-        """Positions of the frames to average over: "all", and "extrapolated" and "rendered" if both exist."""
-        everything = list(range(len(self.frames)))
-        if not any(self.extrapolated) or all(self.extrapolated):
-            return {"all": everything}
-        return {
-            "extrapolated": [i for i in everything if self.extrapolated[i]],
-            "rendered": [i for i in everything if not self.extrapolated[i]],
-            "all": everything,
-        }
+from jaxsr.metrics import METRICS
 
 
 @dataclass(frozen=True)
@@ -130,31 +39,6 @@ class Summary:
     """Number of values in the mean."""
     identical: int
     """Number of infinite values, left out of the mean."""
-
-
-def measured(
-    name: str,
-    images: Sequence[np.ndarray],
-    truths: Sequence[np.ndarray],
-    *,
-    starts: Sequence[bool] | None = None,
-    timing: Timing | None = None,
-    note: str = "",
-    flip_maps: bool = True,
-) -> Track:
-    """A track with every metric of `jaxsr.metrics.measure`, and the FLIP maps for the page if wanted.
-
-    Args:
-        images, truths: display-referred float images [H, W, 3], one pair a frame.
-        starts: True where a frame does not follow the one before it.
-    """
-    if len(images) != len(truths):
-        raise JaxsrError("unequal number of frames", where=name, expected=len(truths), found=len(images))
-    with ThreadPoolExecutor() as pool:  # FLIP is most of the time, and runs outside the interpreter's lock
-        maps = list(pool.map(flip_map, images, truths))
-        small = list(pool.map(flip_jpeg, maps)) if flip_maps else ()
-    found = measure(images, truths, starts=starts, flip_maps=maps)
-    return Track(name, images, found, timing, note, small)
 
 
 def summarise(values: Values) -> Summary:
@@ -171,18 +55,109 @@ def summarise(values: Values) -> Summary:
     return Summary(mean, spread, len(finite), identical)
 
 
-def summary(track: Track, key: str, positions: Sequence[int]) -> Summary:
+def summary(track: Track, key: str, positions: Sequence[int], region: str = ALL) -> Summary:
     """`summarise` of metric `key` of a track at some positions; nothing defined if the track lacks it."""
-    values = track.metrics.get(key)
+    values = track.over(region).get(key)
     return summarise([] if values is None else [values[i] for i in positions])
 
 
-def best(section: Section, key: str, positions: Sequence[int]) -> set[str]:
+def best(section: Section, key: str, positions: Sequence[int], region: str = ALL) -> set[str]:
     """Names of the tracks with the best mean, as far as the shown digits tell them apart."""
+    return _winners({t.name: summary(t, key, positions, region).mean for t in section.tracks}, key)
+
+
+def _winners(means: Mapping[str, float | None], key: str) -> set[str]:
     sign = 1 if METRICS[key].higher_is_better else -1
-    means = {t.name: summary(t, key, positions).mean for t in section.tracks}
     shown = {n: round(sign * m, METRICS[key].digits) for n, m in means.items() if m is not None}
     return {n for n, m in shown.items() if m == max(shown.values())} if len(means) > 1 else set()
+
+
+@dataclass(frozen=True)
+class Line:
+    """What a table says of one method."""
+
+    name: str
+    note: str
+    summaries: Mapping[str, Summary]
+    timing: Timing | None
+    cost: Cost | None
+
+
+@dataclass(frozen=True)
+class Scores:
+    """A table before it is formatted: some frames and pixels of one section, or of all of one task."""
+
+    title: str
+    subset: str
+    region: str
+    count: str
+    """Over how many frames or sequences."""
+    keys: Sequence[str]
+    lines: Sequence[Line]
+
+    @property
+    def about(self) -> str:
+        """Which frames and pixels."""
+        return f"{self.subset} ({self.count})" + (f" · {self.region}" if self.region != ALL else "")
+
+
+def scores(section: Section, subset: str, region: str = ALL) -> Scores:
+    """The means of a section over the frames of one of its subsets and the pixels of one of its regions."""
+    positions, keys = section.subsets()[subset], section.metric_keys()
+    lines = [
+        Line(t.name, t.note, {k: summary(t, k, positions, region) for k in keys}, t.timing, t.cost)
+        for t in section.tracks
+    ]
+    count = f"{len(positions)} frame{'s' if len(positions) != 1 else ''}"
+    return Scores(section.title, subset, region, count, keys, lines)
+
+
+def groups(sections: Sequence[Section]) -> dict[str, list[Section]]:
+    """The sections of each task that has several."""
+    tasks: dict[str, list[Section]] = {}
+    for section in sections:
+        if section.task:
+            tasks.setdefault(section.task, []).append(section)
+    return {task: found for task, found in tasks.items() if len(found) > 1}
+
+
+def mean_scores(task: str, sections: Sequence[Section], subset: str, region: str = ALL) -> Scores:
+    """The mean over sections of the methods that all of them have."""
+    single = [scores(section, subset, region) for section in sections]
+    found = [{line.name: line for line in one.lines} for one in single]
+    lines = []
+    for name in (n for n in found[0] if all(n in one for one in found)):
+        same = [one[name] for one in found]
+        means = {k: summarise([_of(line, k).mean for line in same]) for k in single[0].keys}
+        timings = [line.timing for line in same if line.timing]
+        costs = [line.cost for line in same if line.cost]
+        timing = Timing(*np.mean([list(vars(t).values()) for t in timings], 0).tolist()) if timings else None
+        cost = costs[0] if costs else None
+        lines.append(Line(name, same[0].note, means, timing, cost))
+    return Scores(f"mean, {task}", subset, region, f"{len(sections)} sequences", single[0].keys, lines)
+
+
+def _of(line: Line, key: str) -> Summary:
+    return line.summaries.get(key, summarise([]))
+
+
+def all_scores(sections: Sequence[Section], brief: bool = False) -> Iterator[Scores]:
+    """All tables of some sections: each section, then the means of each task.
+
+    Args:
+        brief: only the first subset of the frames (the extrapolated ones where there are any, else all), and
+            regions only of what comes last.
+    """
+    means = groups(sections)
+    for section in sections:
+        for subset in list(section.subsets())[: 1 if brief else None]:
+            for region in section.regions()[: 1 if brief and section.task in means else None]:
+                yield scores(section, subset, region)
+    for task, same in means.items():
+        subsets = [s for s in same[0].subsets() if all(s in section.subsets() for section in same)]
+        for subset in subsets[: 1 if brief else None]:
+            for region in same[0].regions():
+                yield mean_scores(task, same, subset, region)
 
 
 def number(value: float | None, digits: int) -> str:
@@ -217,68 +192,90 @@ def duration(ms: float) -> str:
 
 
 def rows(
-    section: Section, subset: str, spread: bool = True
+    table: Scores, spread: bool = True, costs: bool = True
 ) -> tuple[list[str], list[list[str]], list[list[bool]]]:
-    """Column titles, the cells of each track, and which of those are the best of their column."""
-    positions = section.subsets()[subset]
-    keys = section.metric_keys()
-    winners = {key: best(section, key, positions) for key in keys}
-    timed = any(t.timing for t in section.tracks)
-    columns = ["Method", *(header(k) for k in keys), *(["Frame [ms]", "Compile [s]"] if timed else [])]
-    cells, marks = [], []
-    for track in section.tracks:
-        line = [track.name, *(cell(summary(track, k, positions), k, spread) for k in keys)]
-        mark = [False, *(track.name in winners[k] for k in keys)]
-        if timed:
-            t = track.timing
-            line += [duration(t.median_ms) + (f" ± {duration(t.spread_ms)}" if spread else "") if t else "–"]
-            line += [f"{t.compile_s:.1f}" if t else "–"]
-            mark += [False, False]
-        cells.append(line)
-        marks.append(mark)
+    """Column titles, the cells of each method, and which of those are the best of their column.
+
+    Args:
+        spread: of metrics and times, beside their mean.
+        costs: time and size too.
+    """
+    winners = {key: _winners({n.name: _of(n, key).mean for n in table.lines}, key) for key in table.keys}
+    more = _cost_columns(table, spread) if costs else {}
+    columns = ["Method", *(header(k) for k in table.keys), *more]
+    cells = [[n.name, *(cell(_of(n, k), k, spread) for k in table.keys)] for n in table.lines]
+    cells = [[*line, *(values[i] for values in more.values())] for i, line in enumerate(cells)]
+    marks = [[False, *(n.name in winners[k] for k in table.keys), *[False] * len(more)] for n in table.lines]
     return columns, cells, marks
 
 
+def _cost_columns(table: Scores, spread: bool) -> dict[str, list[str]]:
+    """Title and cells of the columns of time and, if any method has a network, of size."""
+    timings, costs = [n.timing for n in table.lines], [n.cost for n in table.lines]
+    found = {}
+    if any(timings):
+        found["Frame [ms]"] = [_frame_time(t, spread) if t else "–" for t in timings]
+        found["Compile [s]"] = [f"{t.compile_s:.1f}" if t else "–" for t in timings]
+    if any(c is not None and c.parameters for c in costs):
+        found["Parameters"] = [f"{c.parameters:,}" if c and c.parameters else "–" for c in costs]
+        found["MAC / px"] = [f"{c.multiply_adds_per_px:,.0f}" if c and c.parameters else "–" for c in costs]
+    return found
+
+
+def _frame_time(timing: Timing, spread: bool) -> str:
+    return duration(timing.median_ms) + (f" ± {duration(timing.spread_ms)}" if spread else "")
+
+
 def rich_tables(sections: Sequence[Section], brief: bool = False) -> list[Table]:
-    """One table of means a section and subset for the terminal, best values bold and green.
+    """Tables of means for the terminal, best values bold and green; time and size come last.
 
     A star: identical frames, whose PSNR is infinite, are not in the mean.
 
     Args:
-        brief: only the first subset of each section: the extrapolated frames where there are any, else all.
+        brief: fewer of them, see `all_scores`.
     """
+    found = list(all_scores(sections, brief))
     tables = []
-    for section in sections:
-        for subset, positions in list(section.subsets().items())[: 1 if brief else None]:
-            columns, cells, marks = rows(section, subset, spread=False)
-            title = f"{escape(section.title)} · {subset} ({len(positions)} frames)"
-            table = Table(title=title, title_justify="left", title_style="bold", box=SIMPLE_HEAD)
-            for i, column in enumerate(columns):
-                title = escape(column.replace(" [", "\n["))
-                table.add_column(
-                    title, justify="right" if i else "left", no_wrap=i > 0, min_width=0 if i else 12
-                )
-            for line, mark in zip(cells, marks, strict=True):
-                pairs = zip(line, mark, strict=True)
-                table.add_row(*(f"[bold green]{escape(c)}[/]" if m else escape(c) for c, m in pairs))
+    for one in found:
+        columns, cells, marks = rows(one, spread=False, costs=False)
+        table = _table(f"{one.title} · {one.about}", columns)
+        for line, mark in zip(cells, marks, strict=True):
+            pairs = zip(line, mark, strict=True)
+            table.add_row(*(f"[bold green]{escape(c)}[/]" if m else escape(c) for c, m in pairs))
+        tables.append(table)
+    averaged = {section.title for same in groups(sections).values() for section in same}
+    last = {one.title: one for one in reversed(found) if one.title not in averaged}
+    for title, one in reversed(last.items()):
+        costs = _cost_columns(one, spread=False)
+        if costs:
+            table = _table(f"{title} · cost of a frame", ["Method", *costs])
+            for i, line_ in enumerate(one.lines):
+                table.add_row(escape(line_.name), *(values[i] for values in costs.values()))
             tables.append(table)
     return tables
+
+
+def _table(title: str, columns: Sequence[str]) -> Table:
+    table = Table(title=escape(title), title_justify="left", title_style="bold", box=SIMPLE_HEAD)
+    for i, column in enumerate(columns):
+        name = escape(column.replace(" [", "\n["))
+        table.add_column(name, justify="right" if i else "left", no_wrap=i > 0, min_width=0 if i else 12)
+    return table
 
 
 def markdown(sections: Sequence[Section]) -> str:
     """The same tables as GitHub Markdown, best values bold."""
     out = []
-    for section in sections:
-        for subset, positions in section.subsets().items():
-            columns, cells, marks = rows(section, subset)
-            out += [f"**{section.title}** · {subset} ({len(positions)} frames)", ""]
-            out += ["| " + " | ".join(columns) + " |", "|---" + "|---:" * (len(columns) - 1) + "|"]
-            for line, mark in zip(cells, marks, strict=True):
-                safe = [c.replace("|", r"\|") for c in line]
-                out.append(
-                    "| " + " | ".join(f"**{c}**" if m else c for c, m in zip(safe, mark, strict=True)) + " |"
-                )
-            out.append("")
+    for one in all_scores(sections):
+        columns, cells, marks = rows(one)
+        out += [f"**{one.title}** · {one.about}", ""]
+        out += ["| " + " | ".join(columns) + " |", "|---" + "|---:" * (len(columns) - 1) + "|"]
+        for line, mark in zip(cells, marks, strict=True):
+            safe = [c.replace("|", r"\|") for c in line]
+            out.append(
+                "| " + " | ".join(f"**{c}**" if m else c for c, m in zip(safe, mark, strict=True)) + " |"
+            )
+        out.append("")
     return "\n".join(out)
 
 
@@ -300,29 +297,37 @@ def json_value(value: Any) -> Any:
 
 
 def as_json(sections: Sequence[Section], *, title: str = "", meta: Mapping[str, Any] | None = None) -> dict:
-    """All numbers, without images: per frame, and summarised for each subset of frames."""
+    """All numbers, without images: per frame, and summarised for each subset of frames and each region."""
     out = []
     for section in sections:
         subsets = section.subsets()
         tracks = []
         for track in section.tracks:
-            summaries = {
-                name: {k: vars(summary(track, k, where)) for k in track.metrics}
-                for name, where in subsets.items()
-            }
-            timing = vars(track.timing) if track.timing else None
+
+            def summaries(region: str, track: Track = track) -> dict[str, Any]:
+                return {
+                    name: {k: vars(summary(track, k, where, region)) for k in track.over(region)}
+                    for name, where in subsets.items()  # noqa: B023 (called before the next turn)
+                }
+
             tracks.append(
                 {
                     "name": track.name,
                     "note": track.note,
-                    "timing": timing,
+                    "timing": vars(track.timing) if track.timing else None,
+                    "cost": vars(track.cost) if track.cost else None,
                     "metrics": track.metrics,
-                    "summary": summaries,
+                    "summary": summaries(ALL),
+                    "regions": {
+                        region: {"metrics": track.over(region), "summary": summaries(region)}
+                        for region in track.regions
+                    },
                 }
             )
         out.append(
             {
                 "title": section.title,
+                "task": section.task,
                 "frames": section.frames,
                 "extrapolated": list(section.extrapolated) or [False] * len(section.frames),
                 "exposure": section.exposure,
@@ -330,6 +335,21 @@ def as_json(sections: Sequence[Section], *, title: str = "", meta: Mapping[str, 
                 "tracks": tracks,
             }
         )
+    means = [
+        {
+            "task": task,
+            "sections": [s.title for s in same],
+            "subset": subset,
+            "region": region,
+            "tracks": [
+                {"name": line.name, "summary": {k: vars(v) for k, v in line.summaries.items()}}
+                for line in mean_scores(task, same, subset, region).lines
+            ],
+        }
+        for task, same in groups(sections).items()
+        for subset in same[0].subsets()
+        for region in same[0].regions()
+    ]
     definitions = {k: m._asdict() for k, m in METRICS.items()}
     return json_value(
         {
@@ -339,23 +359,25 @@ def as_json(sections: Sequence[Section], *, title: str = "", meta: Mapping[str, 
             "meta": meta or {},
             "metrics": definitions,
             "sections": out,
+            "means": means,
         }
     )
 
 
 def as_csv(sections: Sequence[Section]) -> str:
-    """One line a section, method and frame; a metric that is not defined is an empty field."""
+    """One line a section, method, frame and region; a metric that is not defined is an empty field."""
     keys = [k for k in METRICS if any(k in s.metric_keys() for s in sections)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["section", "method", "frame", "extrapolated", *keys])
+    writer.writerow(["section", "method", "frame", "extrapolated", "pixels", *keys])
     for section in sections:
         for track in section.tracks:
             for i, frame in enumerate(section.frames):
                 flag = int(bool(section.extrapolated and section.extrapolated[i]))
-                values = [track.metrics[k][i] if k in track.metrics else None for k in keys]
-                shown = ["" if v is None else repr(float(v)) for v in values]
-                writer.writerow([section.title, track.name, frame, flag, *shown])
+                for region in (ALL, *track.regions):
+                    values = [track.over(region)[k][i] if k in track.over(region) else None for k in keys]
+                    shown = ["" if v is None else repr(float(v)) for v in values]
+                    writer.writerow([section.title, track.name, frame, flag, region, *shown])
     return text.getvalue()
 
 

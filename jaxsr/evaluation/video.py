@@ -18,8 +18,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.embedding import to_bytes
-from jaxsr.evaluation.tables import ImageOrPath
+from jaxsr.evaluation.embedding import ImageOrPath, to_bytes
 from jaxsr.io.exr import atomic_path
 
 TARGET_WIDTH = 1920

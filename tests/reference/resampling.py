@@ -43,12 +43,12 @@ def resize(image: np.ndarray, size: tuple[int, int], mode: str, jitter=(0.0, 0.0
     return sample(image, positions, mode, "clamp")
 
 
-def zero_upsample(image: np.ndarray, scale: int) -> np.ndarray:
+def zero_upsample(image: np.ndarray, scale: int, offset=(0, 0)) -> np.ndarray:
     height, width, channels = image.shape
     out = np.zeros((height * scale, width * scale, channels))
     for y in range(height * scale):
         for x in range(width * scale):
-            if y % scale == 0 and x % scale == 0:
+            if y % scale == offset[1] and x % scale == offset[0]:
                 out[y, x] = image[y // scale, x // scale]
     return out
 

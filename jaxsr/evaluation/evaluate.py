@@ -1,0 +1,167 @@
+"""`jaxsr evaluate`: methods over sequences, each against the truth; tables, the comparison page, all numbers.
+
+Writes `out/<sequence>/<method>/` (frames, error maps, results), and into `out` report.html, metrics.json,
+.csv and .md. What was finished is kept (`kept.py`): an interrupted evaluation goes on when it is run again.
+"""
+
+import copy
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.compare import labels
+from jaxsr.evaluation.kept import run_kept
+from jaxsr.evaluation.measuring import Reference
+from jaxsr.evaluation.report import write_report
+from jaxsr.evaluation.run import Ready, check_needs, find_method
+from jaxsr.evaluation.sections import Section
+from jaxsr.evaluation.tables import write_metrics
+from jaxsr.evaluation.upscale import Settings, run_section
+from jaxsr.io.sequence import Sequence as FrameSequence
+
+DEPTH = 3
+"""How far below a folder sequences are looked for."""
+
+
+def find_sequences(places: Sequence[Path]) -> list[Path]:
+    """The sequences at these places: each is one, or a folder that has some in it.
+
+    Raises:
+        JaxsrError: no such folder, or no sequence in it.
+    """
+    found: list[Path] = []
+    for place in places:
+        if not place.is_dir() and place.name != "sequence.json":
+            raise JaxsrError("no such folder", where=place, expected="a sequence, or a folder of sequences")
+        place = place.parent if place.name == "sequence.json" else place
+        here = next(
+            (at for n in range(DEPTH + 1) if (at := sorted(place.glob("*/" * n + "sequence.json")))), None
+        )
+        if here is None:
+            raise JaxsrError(
+                "no sequence in the folder",
+                where=place,
+                expected="a file sequence.json in it, or in folders in it",
+                fix="docs/data.md says how to make one",
+            )
+        found += [file.parent for file in here]
+    if not found:
+        raise JaxsrError("no sequences to evaluate", fix="name at least one folder")
+    return found
+
+
+def find_methods(names: Sequence[str], scale: int) -> list[Ready]:
+    """The methods of these names or files of weights, each with a name of its own.
+
+    Raises:
+        JaxsrError: as for `find_method`; no name; two that would be called the same.
+    """
+    found: dict[str, Ready] = {}
+    for name in names:
+        ready = find_method(name, scale)
+        if ready.method.name in found:
+            raise JaxsrError(
+                f"two methods are called {ready.method.name!r}",
+                where="--methods",
+                found=", ".join(names),
+                fix="name each once; rename a file of weights",
+            )
+        found[ready.method.name] = ready
+    if not found:
+        raise JaxsrError("no methods to evaluate", where="--methods", fix="name at least one")
+    return list(found.values())
+
+
+def part(sequence: FrameSequence, frames: tuple[int, int] | None) -> FrameSequence:
+    """A sequence of the frames with numbers in a range alone, ends included; it begins anew.
+
+    Raises:
+        JaxsrError: there are none.
+    """
+    if frames is None:
+        return sequence
+    infos = [info for info in sequence.infos if frames[0] <= info.index <= frames[1]]
+    if not infos:
+        raise JaxsrError(
+            "no frame in the range",
+            where=sequence.path,
+            expected=f"some of {sequence.infos[0].index}:{sequence.infos[-1].index}",
+            found=f"{frames[0]}:{frames[1]}",
+        )
+    found = copy.copy(sequence)
+    found.infos = [dataclasses.replace(infos[0], cut=True), *infos[1:]]
+    return found
+
+
+def _check(sequence: FrameSequence, methods: Sequence[Ready], settings: Settings) -> None:
+    """See that all can be run and measured, before any work is done."""
+    for i in range(len(sequence)):
+        if "color" not in sequence.layers("hr", i):
+            raise JaxsrError(
+                f"frame {sequence.infos[i].index} has no truth",
+                where=sequence.path,
+                expected="layer 'color' in hr/",
+                fix="render it, or use `jaxsr upscale`, which needs none",
+            )
+    settings.check(sequence)
+    for ready in methods:
+        check_needs(ready.method, sequence, settings.scale)
+
+
+def evaluate(
+    places: Sequence[Path],
+    methods: Sequence[str],
+    out: Path,
+    settings: Settings,
+    *,
+    frames: tuple[int, int] | None = None,
+    title: str = "jaxsr evaluation",
+    meta: Mapping[str, Any] | None = None,
+    progress: Callable[[str, int], Callable[[], Any]],
+) -> list[Section]:
+    """Run methods over sequences, measure them, and write frames, numbers and the page into `out`.
+
+    Args:
+        places: sequences, or folders of sequences.
+        methods: names, or files of weights, as for `find_method`.
+        frames: numbers of the first and the last frame; all by default.
+        meta: shown on the page and kept with the numbers.
+        progress: called with a title and a number of steps; returns what is called after each step.
+
+    Returns:
+        A section a sequence; `rich_tables` prints them.
+
+    Raises:
+        JaxsrError: see `find_sequences`, `find_methods`, `part`, `check_needs`, `run_section`.
+    """
+    if out.exists() and not out.is_dir():
+        raise JaxsrError("not a folder", where=out, fix="choose another --out")
+    ready = find_methods(methods, settings.scale)
+    paths = find_sequences(places)
+    names = labels(paths)
+    sequences = [part(FrameSequence.open(path), frames) for path in paths]
+    for sequence in sequences:
+        _check(sequence, ready, settings)
+    advance = progress("frames", 2 * len(ready) * sum(map(len, sequences)))  # made, and measured
+    compiled: dict[Any, float] = {}
+    sections = [
+        run_section(
+            sequence,
+            ready,
+            out / name,
+            settings,
+            reference=Reference(sequence, in_regions=True),
+            advance=advance,
+            compiled=compiled,
+            run=run_kept,
+            title=name,
+        )
+        for name, sequence in zip(names, sequences, strict=True)
+    ]
+    advance = progress("page", 1)
+    write_report(out / "report.html", sections, title=title, meta=meta)
+    write_metrics(out, sections, title=title, meta=meta)
+    advance()
+    return sections

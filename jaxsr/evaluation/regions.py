@@ -1,0 +1,60 @@
+"""Where methods are told apart: masks of an image's edges and of what has just come into view.
+
+Masks are bool `[H, W]`, True where a pixel counts, at the size of the HR G-buffer; `metrics.measure_frame`
+takes them. They are made of the G-buffer alone: they are the same for all methods, and noise of the truth
+is no edge.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from jaxsr.frames import Frame, GBuffer
+from jaxsr.ops.masks import disocclusion_mask
+
+BEND = 0.1
+
+REGIONS = {
+    "edges": "The pixels on both sides of an outline: along a row or column of the HR depth, the inverse of "
+    f"the depth is off the straight line of its two neighbours by more than {BEND:.0%} of the largest of the "
+    "three. Neither a slanted plane nor a texture, a shadow or a crease is one.",
+    "disocclusions": "What was out of sight in the frame before: holes of "
+    "jaxsr.ops.masks.disocclusion_mask between the two HR G-buffers. There are none at a cut or a start.",
+}
+"""Definitions, by name."""
+
+
+@jax.jit
+def _edges(depth: Array) -> Array:
+    # 1/depth is linear over the image of a plane at any slant, and 0 for sky.
+    inverse = 1 / depth[..., 0]
+    found = []
+    for v in (inverse, inverse.T):
+        before, middle, after = v[:-2], v[1:-1], v[2:]
+        largest = jnp.maximum(jnp.maximum(before, after), middle)
+        found.append(jnp.pad(jnp.abs(before + after - 2 * middle) > BEND * largest, ((1, 1), (0, 0))))
+    return found[0] | found[1].T
+
+
+def edges(gbuffer: GBuffer) -> Bool[np.ndarray, "h w"]:
+    """The edges of an HR G-buffer, of its depth alone; see `REGIONS`. At the border along the border only."""
+    return np.asarray(_edges(gbuffer.depth_linear))
+
+
+def disocclusions(frame: Frame, previous: Frame | None) -> Bool[np.ndarray, "h w"]:
+    """What the HR frame shows and the previous one did not; see `REGIONS`."""
+    if previous is None or bool(frame.cut):
+        return np.zeros(frame.hr.depth_linear.shape[:2], bool)
+    valid = disocclusion_mask(frame.hr, previous.hr, frame.camera, previous.camera)
+    return np.asarray(valid)[..., 0] == 0
+
+
+def regions(frame: Frame, previous: Frame | None) -> dict[str, Bool[np.ndarray, "h w"]]:
+    """The mask of each of `REGIONS` for a frame.
+
+    Args:
+        frame: of one image, not a batch.
+        previous: the frame before it; None at a start.
+    """
+    return {"edges": edges(frame.hr), "disocclusions": disocclusions(frame, previous)}

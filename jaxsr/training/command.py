@@ -1,0 +1,65 @@
+"""`jaxsr train METHOD`: the options of a training and those of a method, as one command line."""
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import tyro
+
+from jaxsr.data.cache import default_cache
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.progress import bars
+from jaxsr.evaluation.sample import unpack_sample
+from jaxsr.methods import LEARNED, Learned
+from jaxsr.training.config import TrainConfig
+from jaxsr.training.loop import train
+
+DESCRIPTION = """Train the network of a method; run again, go on with it.
+
+Every option is one of a dataclass: of the training (jaxsr.training.TrainConfig), or of the method."""
+
+
+def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> None:
+    """Train as the arguments after `jaxsr train` say.
+
+    Args:
+        arguments: the method's name, then options.
+        learned: methods by name; `jaxsr.methods.LEARNED` by default.
+
+    Raises:
+        JaxsrError: no such method, and what `train` raises.
+        SystemExit: bad syntax, or help was asked for.
+    """
+    learned = LEARNED if learned is None else learned
+    name, *rest = arguments or [""]
+    if name in ("-h", "--help"):
+        print(f"usage: jaxsr train {{{','.join(learned)}}} [options]\n\n{DESCRIPTION}\n")
+        print(f"`jaxsr train {next(iter(learned))} --help` lists the options.")
+        return
+    if name not in learned:
+        raise JaxsrError(
+            f"no method {name!r} that learns" if name else "no method to train",
+            where="jaxsr train",
+            expected=f"one of {', '.join(learned)}",
+            fix="name it before the options",
+        )
+    options = learned[name].options
+    both = dataclasses.make_dataclass(
+        "both", [("training", TrainConfig, TrainConfig()), ("method", options, options())]
+    )
+    chosen: Any = tyro.cli(
+        both,
+        args=rest,
+        prog=f"jaxsr train {name}",
+        description=DESCRIPTION,
+        config=(tyro.conf.OmitArgPrefixes,),
+    )
+    config, method = chosen.training, learned[name].method(chosen.method)
+    config.check()
+    if not config.data:
+        folder = (config.cache or default_cache().parent) / "sample"
+        with bars() as progress:
+            sample = unpack_sample(folder, "train", scale=config.scale, progress=progress)
+        config = dataclasses.replace(config, data=tuple(sample))
+    weights = train(method, config)
+    print(f"{weights}: use it with `jaxsr upscale SEQ --method {weights} --scale {config.scale}`")

@@ -1,0 +1,203 @@
+"""What a training leaves to look at: `log.csv`, TensorBoard, pictures, the loss curve, and the bar on screen.
+
+All of it begins again where a resumed training does: rows and events past its checkpoint are dropped.
+"""
+
+import csv
+import io
+import math
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxsr.errors import JaxsrError
+from jaxsr.io.exr import atomic_path
+from jaxsr.io.images import write_png
+
+
+class Log:
+    """Rows of numbers by step, as CSV with an empty field where a row has no such number, and in TensorBoard.
+
+    Args:
+        out: folder of the training.
+        step: of the checkpoint that it goes on from; later rows are dropped.
+
+    Raises:
+        JaxsrError: log.csv is no such file.
+    """
+
+    def __init__(self, out: Path, step: int):
+        from tensorboardX import SummaryWriter
+
+        self._out, self._file = out, out / "log.csv"
+        self.rows = [row for row in _read(self._file) if row["step"] <= step]
+        self._columns = list(dict.fromkeys(name for row in self.rows for name in row))
+        self._rewrite()
+        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=step + 1 if step else None)
+
+    def add(self, row: dict[str, float]) -> None:
+        """One more row; "step" is among its numbers."""
+        self.rows.append(row)
+        new = [name for name in row if name not in self._columns]
+        self._columns += new
+        if new:
+            self._rewrite()
+        else:
+            with self._file.open("a", encoding="utf-8", newline="") as file:
+                self._writer(file).writerow(row)
+        for name, value in row.items():
+            if name != "step":
+                self._board.add_scalar(name, value, int(row["step"]))
+
+    def picture(self, image: Float[np.ndarray, "h w 3"], step: int) -> None:
+        """`pictures/step-000500.png`, and the same in TensorBoard."""
+        write_png(self._out / "pictures" / f"step-{step:06d}.png", image)
+        self._board.add_image("input, network, truth", image, step, dataformats="HWC")
+
+    def curve(self) -> None:
+        """`loss.png`: the loss, and the PSNR of the evaluations, over the steps."""
+        plot_curve(self._out / "loss.png", self.rows)
+
+    def flush(self) -> None:
+        """See that TensorBoard's file holds what was added."""
+        self._board.flush()
+
+    def close(self) -> None:
+        """End TensorBoard's thread."""
+        self._board.close()
+
+    def _writer(self, file: Any) -> csv.DictWriter:
+        return csv.DictWriter(file, self._columns, restval="", lineterminator="\n")
+
+    def _rewrite(self) -> None:
+        text = io.StringIO()
+        writer = self._writer(text)
+        if self._columns:
+            writer.writeheader()
+        writer.writerows(self.rows)
+        with atomic_path(self._file) as temporary:
+            temporary.write_text(text.getvalue(), encoding="utf-8")
+
+
+def _read(file: Path) -> list[dict[str, float]]:
+    if not file.is_file():
+        return []
+    try:
+        # A killed writer may have left a part of the last line.
+        whole = file.read_text(encoding="utf-8").rpartition("\n")[0]
+        rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(whole.splitlines())]
+        return [row | {"step": int(row["step"])} for row in rows]
+    except (ValueError, TypeError, KeyError, AttributeError) as e:
+        raise JaxsrError("not the log of a training", where=file, found=e, fix="delete it") from e
+
+
+def plot_curve(path: Path, rows: list[dict[str, float]]) -> None:
+    """Loss (each row, and smoothed) on a logarithmic axis over the PSNR of the evaluations, as PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    losses = np.array([(row["step"], row["loss"]) for row in rows if "loss" in row], float).reshape(-1, 2)
+    scores = np.array([(row["step"], row["eval/psnr"]) for row in rows if "eval/psnr" in row], float).reshape(
+        -1, 2
+    )
+    figure = Figure(figsize=(7, 5), layout="constrained")
+    FigureCanvasAgg(figure)
+    top, bottom = figure.subplots(2, 1, sharex=True)
+    top.plot(losses[:, 0], losses[:, 1], color="tab:blue", alpha=0.35, linewidth=0.8)
+    top.plot(losses[:, 0], _smooth(losses[:, 1]), color="tab:blue")
+    if (losses[:, 1] > 0).all():
+        top.set_yscale("log")
+    top.set_ylabel("loss")
+    bottom.plot(scores[:, 0], scores[:, 1], color="tab:green", marker=".")
+    bottom.set_ylabel("PSNR of the evaluation (dB)")
+    bottom.set_xlabel("step")
+    for axes in (top, bottom):
+        axes.grid(alpha=0.3)
+    with atomic_path(path) as temporary:
+        figure.savefig(temporary, format="png", dpi=110)
+
+
+def _smooth(values: np.ndarray) -> np.ndarray:
+    """The mean over a twentieth of the values, centred; shorter at the ends."""
+    n = len(values)
+    half = n // 40
+    total = np.concatenate([[0.0], np.cumsum(values)])
+    low, high = np.maximum(np.arange(n) - half, 0), np.minimum(np.arange(n) + half + 1, n)
+    return (total[high] - total[low]) / (high - low)
+
+
+class Bar:
+    """The bar on stderr: loss, rate and remaining time; where that is no terminal, a line now and then.
+
+    Use it in a `with` block.
+
+    Args:
+        done, total: steps.
+        quiet: show nothing.
+    """
+
+    LINE_SECONDS = 30.0
+
+    def __init__(self, done: int, total: int, *, quiet: bool = False):
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+        self._console = Console(stderr=True, quiet=quiet, soft_wrap=True, highlight=False)
+        self._total, self._left_of = total, done
+        self._rates: list[tuple[float, int]] = []
+        self.rate = "-"
+        self._printed = time.monotonic()
+        columns = (
+            TextColumn("steps"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("loss {task.fields[loss]}", style="bold"),
+            TextColumn("{task.fields[rate]}", style="cyan"),
+            TimeElapsedColumn(),
+            TextColumn("left {task.fields[left]}"),
+        )
+        self._progress = Progress(*columns, console=self._console)
+        self._task = self._progress.add_task("", total=total, completed=done, loss="-", rate="-", left="-")
+
+    def __enter__(self) -> "Bar":
+        if self._console.is_terminal:
+            self._progress.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        if self._console.is_terminal:
+            self._progress.stop()
+
+    def say(self, text: str) -> None:
+        """A line above the bar."""
+        self._printed = time.monotonic()
+        self._console.print(text, markup=False)
+        sys.stderr.flush()
+
+    def update(self, step: int, loss: float) -> None:
+        """A step was done."""
+        now = time.monotonic()
+        self._rates = [*self._rates[-29:], (now, step)]
+        (then, first) = self._rates[0]
+        speed = (step - first) / (now - then) if now > then else math.nan
+        self.rate = (
+            "-" if not speed > 0 else f"{speed:.2f} steps/s" if speed >= 1 else f"{1 / speed:.2f} s/step"
+        )
+        left = "-" if not speed > 0 else _clock((self._total - step) / speed)
+        self._progress.update(self._task, completed=step, loss=f"{loss:.4f}", rate=self.rate, left=left)
+        if not self._console.is_terminal and now - self._printed > self.LINE_SECONDS:
+            self.say(f"step {step}/{self._total}: loss {loss:.4f}, {self.rate}, {left} left")
+
+    def pause(self) -> None:
+        """What comes now does not count towards the rate."""
+        self._rates = []
+
+
+def _clock(seconds: float) -> str:
+    minutes, s = divmod(round(seconds), 60)
+    hours, m = divmod(minutes, 60)
+    return f"{hours}:{m:02d}:{s:02d}"
