@@ -17,9 +17,10 @@ import statistics
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import jax
@@ -27,7 +28,10 @@ import numpy as np
 
 RESULTS = Path(__file__).parent / "results"
 SIZES = ("480x270", "960x540", "1920x1080")
-PACKAGES = ("jax", "jaxlib", "numpy", "numba", "opencv-python-headless", "torch", "dm-pix")
+PACKAGES = (
+    "jax", "jaxlib", "flax", "numpy", "numba", "opencv-python-headless", "torch", "dm-pix", "onnxruntime",
+    "jax2onnx",
+)  # fmt: skip
 
 Inputs = tuple[np.ndarray, ...]
 
@@ -48,11 +52,11 @@ class Variant(NamedTuple):
     """Pixels of the largest image worth waiting for."""
 
 
-def arguments(description: str | None) -> argparse.Namespace:
+def arguments(description: str | None, sizes: Sequence[str] = SIZES) -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--sizes", nargs="+", default=SIZES, metavar="WxH")
+    parser.add_argument("--sizes", nargs="+", default=sizes, metavar="WxH")
     parser.add_argument("--rounds", type=int, default=15, help="timed calls of each variant")
     parser.add_argument("--quick", action="store_true", help="one small size, three rounds, nothing written")
     parser.add_argument("--memory", nargs=3, metavar=("QUESTION", "VARIANT", "SIZE"), help=argparse.SUPPRESS)
@@ -156,6 +160,7 @@ def run(
     references: dict[str, str],
     args: argparse.Namespace,
     missing: Iterable[str] = (),
+    fixed: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
     """Time all variants of all questions at all sizes, print, and write the result files.
 
@@ -165,6 +170,7 @@ def run(
         references: for each question the variant that the others are divided by.
         args: what `arguments` returned.
         missing: names of peers that are not installed.
+        fixed: the one size of questions that do not scale with the image.
     """
     if args.memory:
         question, name, size = args.memory
@@ -173,10 +179,13 @@ def run(
     for name in missing:
         print(f"{name}: not installed")
     rows = []
-    for size in args.sizes:
+    sizes = args.sizes if args.quick else [*args.sizes, *fixed.values()]
+    for size in dict.fromkeys(sizes):
         width, height = parse_size(size)
         inputs = scene(width, height)
         for question, variants in questions.items():
+            if not args.quick and size not in ([fixed[question]] if question in fixed else args.sizes):
+                continue
             built = {v.name: v.build(inputs) for v in variants if width * height <= v.largest}
             times = time_interleaved({name: prepared.call for name, prepared in built.items()}, args.rounds)
             for name, numbers in summarise(times, references[question]).items():

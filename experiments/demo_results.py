@@ -4,7 +4,7 @@
 
 Runs the demo at x2 and x4; writes experiments/results/demo.json (every metric of every frame), demo.md
 (tables with spread and time), the results in README, and docs/images/demo_<task>.png (crops: input, methods,
-truth).
+truth). LPIPS is among the metrics if the extra `perceptual` is installed.
 """
 
 import json
@@ -24,7 +24,8 @@ from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description, run_demo
 from jaxsr.evaluation.progress import bars
 from jaxsr.evaluation.sample import unpack_sample
-from jaxsr.evaluation.tables import Section, as_json, best, cell, duration, header, summary
+from jaxsr.evaluation.sections import Section
+from jaxsr.evaluation.tables import as_json, best, cell, duration, header, summary
 from jaxsr.io.exr import atomic_path
 from jaxsr.io.images import write_png
 
@@ -80,14 +81,25 @@ def table(sections: list[Section], task: str) -> list[str]:
     return lines
 
 
-def readme_block(document: dict[str, Any], scale: int = 2) -> str:
+README = {
+    "psnr": ("PSNR in dB", 2),
+    "ssim": ("SSIM", 3),
+    "lpips": ("LPIPS", 3),
+    "flip": ("FLIP", 3),
+    "tpsnr": ("temporal PSNR in dB", 2),
+}
+"""The metrics of README: what they are called there, and their digits."""
+
+
+def readme_block(document: dict[str, Any]) -> str:
     """The results of README: a row a method, a column a scene, from the numbers in demo.json."""
-    keys = ("psnr", "ssim", "flip", "tpsnr")
-    digits = {"psnr": 2, "ssim": 3, "flip": 3, "tpsnr": 2}
+    keys = [key for key in README if key in document["sections"][0]["tracks"][0]["metrics"]]
+    names = " · ".join(README[key][0] for key in keys)
     lines = []
-    for task, title in (
-        ("super-resolution", f"Super-resolution x{scale}, all frames"),
-        ("extrapolation", f"Every second frame extrapolated from x{scale} history, extrapolated frames only"),
+    for task, scale, title in (
+        ("super-resolution", 2, "Super-resolution x2, all frames"),
+        ("super-resolution", 4, "Super-resolution x4, all frames"),
+        ("extrapolation", 2, "Every second frame extrapolated from x2 history, extrapolated frames only"),
     ):
         subset = "extrapolated" if task == "extrapolation" else "all"
         chosen = [
@@ -97,7 +109,7 @@ def readme_block(document: dict[str, Any], scale: int = 2) -> str:
         ]
         scenes = [s["meta"]["sequence"].split("-")[0] for s in chosen]
         lines += [
-            f"{title} (PSNR in dB · SSIM · FLIP · temporal PSNR in dB):",
+            f"{title} ({names}):",
             "",
             f"| method | {' | '.join(scenes)} |",
             "|---|" + "---|" * len(scenes),
@@ -106,7 +118,7 @@ def readme_block(document: dict[str, Any], scale: int = 2) -> str:
             cells = []
             for section in chosen:
                 found = section["tracks"][k]["summary"][subset]
-                cells.append(" · ".join(f"{found[key]['mean']:.{digits[key]}f}" for key in keys))
+                cells.append(" · ".join(f"{found[key]['mean']:.{README[key][1]}f}" for key in keys))
             name = LABELS[task].get(track["name"], f"`{track['name']}`")
             lines.append(f"| {name} | {' | '.join(cells)} |")
         lines.append("")
@@ -170,7 +182,8 @@ def main(config: Config) -> None:
     with tempfile.TemporaryDirectory() as folder, bars() as progress:
         for scale in config.scales:
             paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)
-            sections += run_demo(Path(folder) / f"x{scale}", paths, scale=scale, progress=progress)
+            out = Path(folder) / f"x{scale}"
+            sections += run_demo(out, paths, scale=scale, lpips=True, progress=progress)
     state = commit()
     meta = description(
         commit=state,

@@ -24,6 +24,7 @@ def demo(
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("jaxsr-demo"),
     scale: int = 2,
     scenes: tuple[str, ...] = (),
+    lpips: bool = False,
 ) -> None:
     """Upscale and extrapolate the sample that ships with jaxsr; write frames, videos, metrics and a page.
 
@@ -31,6 +32,7 @@ def demo(
         out: folder for everything that is made.
         scale: of the low-resolution frames to start from, 2 or 4.
         scenes: only these of the sample's scenes, by name.
+        lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes longer than all the rest.
     """
     from rich.console import Console
 
@@ -40,7 +42,7 @@ def demo(
 
     with bars() as progress:
         sequences = unpack_sample(out / "sample", "test", scenes, scale, progress)
-        sections = run_demo(out, sequences, scale=scale, progress=progress)
+        sections = run_demo(out, sequences, scale=scale, lpips=lpips, progress=progress)
     console = Console()
     for table in rich_tables(sections, brief=True):
         console.print(table)

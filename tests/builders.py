@@ -79,6 +79,15 @@ def random_weights(path: Path, *, scale: int, method: str = "fusion-sr", seed: i
     """A file of weights as training writes it, but of a network that has learned nothing."""
     made = build(method, {})
     assert made.new_net is not None
-    header = {"method": method, "arguments": dict(made.arguments), "scale": scale}
-    save_weights(path, nnx.state(made.new_net(nnx.Rngs(seed)), nnx.Not(nnx.RngState)), header)
+    new_net, rng = made.new_net, np.random.default_rng(seed)
+    # Not what `new_net` begins with: that may be made to change nothing, and takes long to make.
+    state = nnx.state(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))), nnx.Not(nnx.RngState))
+    arrays = {}
+    for place, variable in nnx.to_flat_state(state):
+        shape = variable.get_value().shape
+        if place[-1] == "kernel":
+            arrays[".".join(map(str, place))] = rng.normal(size=shape) / np.sqrt(np.prod(shape[:-1]))
+        else:
+            arrays[".".join(map(str, place))] = np.full(shape, float(place[-1] in ("scale", "var")))
+    save_weights(path, arrays, {"method": method, "arguments": dict(made.arguments), "scale": scale})
     return path

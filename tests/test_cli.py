@@ -8,7 +8,7 @@ import pytest
 import jaxsr.cli
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.images import write_png
-from tests.builders import make_sequence
+from tests.builders import make_sequence, random_weights
 
 
 def run(capsys, *arguments) -> tuple[int, str, str]:
@@ -45,7 +45,16 @@ def test_help_answers_without_loading_jax():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    for verb in ("demo", "inspect", "compare", "upscale", "render"):
+    for verb in (
+        "demo",
+        "inspect",
+        "compare",
+        "upscale",
+        "evaluate",
+        "render",
+        "train",
+        "convert-weights",
+    ):
         assert verb in done.stdout
 
 
@@ -77,20 +86,40 @@ def test_compare_writes_a_page(capsys, sequence, tmp_path):
     assert (out / "report.html").is_file()
 
 
-@pytest.mark.parametrize("verb", ["inspect", "upscale"])
+def test_a_file_of_weights_is_a_method(capsys, sequence, tmp_path):
+    weights = random_weights(tmp_path / "mine.safetensors", scale=2)
+    out = tmp_path / "out"
+    status, text, _ = run(
+        capsys, "evaluate", sequence.path, "--methods", f"nearest, {weights}", "--scale", 2, "--no-lpips",
+        "--every", 2, "--warmup", 1, "-o", out,
+    )  # fmt: skip
+    assert status == 0
+    assert "mine" in text
+    assert "extrapolated" in text
+    assert "edges" in text
+    assert json.loads((out / "metrics.json").read_text())["meta"]["warmup"] == 1
+    assert len(list((out / "seq" / "mine" / "png").iterdir())) == 3
+    for name in ("report.html", "metrics.csv", "metrics.md"):
+        assert (out / name).is_file()
+
+
+@pytest.mark.parametrize("verb", ["inspect", "upscale", "evaluate"])
 class TestSequenceCommands:
     """Commands that read a sequence."""
 
     def test_missing(self, capsys, tmp_path, verb):
-        assert "no such folder" in error_line(capsys, verb, tmp_path / "nothing")
+        assert "no such folder" in error_line(capsys, *self.arguments(verb, tmp_path / "nothing"))
 
     def test_not_a_sequence(self, capsys, tmp_path, verb):
         (tmp_path / "empty").mkdir()
-        assert "sequence.json" in error_line(capsys, verb, tmp_path / "empty")
+        assert "sequence.json" in error_line(capsys, *self.arguments(verb, tmp_path / "empty"))
 
     def test_mismatched_count(self, capsys, sequence, verb):
         (sequence.path / "x2" / "0002.exr").unlink()
-        assert "0002.exr" in error_line(capsys, verb, sequence.path)
+        assert "0002.exr" in error_line(capsys, *self.arguments(verb, sequence.path))
+
+    def arguments(self, verb, path):
+        return (verb, path, *(("--methods", "nearest", "--scale", 2) if verb == "evaluate" else ()))
 
 
 def rewrite(file, change):
@@ -146,6 +175,43 @@ def test_upscale_nan(capsys, sequence, tmp_path):
 def test_upscale_arguments(capsys, sequence, tmp_path, arguments, expected):
     assert expected in error_line(capsys, "upscale", sequence.path, "-o", tmp_path / "out", *arguments)
     assert not list((tmp_path / "out").rglob("*.exr"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (["--methods", "taau,magic"], "unknown method 'magic'"),
+        (["--methods", "taau,taau"], "two methods are called 'taau'"),
+        (["--methods", " , "], "no methods to evaluate"),
+        (["--methods", "fusion-sr"], "no weights of 'fusion-sr' for scale 2"),
+        (["--methods", "none.safetensors"], "none.safetensors: no such file of weights"),
+        (["--methods", "text.safetensors"], "text.safetensors: cannot read the weights"),
+        (["--methods", "taau", "--scale", "3"], "scale 3 is not available"),
+        (["--methods", "taau", "--every", "0"], "every"),
+        (["--methods", "taau", "--warmup", "3"], "no frame is left to measure"),
+        (["--methods", "taau", "--frames", "8:9"], "no frame in the range"),
+        (["--methods", "taau", "--frames", "x"], "bad range of frames"),
+        (["--methods", "taau", "-o", "text.safetensors"], "not a folder"),
+    ],
+)
+def test_evaluate_arguments(capsys, sequence, tmp_path, monkeypatch, arguments, expected):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("jaxsr.evaluation.run.weights_folder", lambda: tmp_path / "none")
+    (tmp_path / "text.safetensors").write_text("these are no weights")
+    command = ("evaluate", sequence.path, "--scale", "2", "-o", tmp_path / "out", *arguments)
+    assert expected in error_line(capsys, *command)
+    assert not (tmp_path / "out").exists()
+
+
+def test_evaluate_wants_sequences(capsys, tmp_path):
+    assert "no sequences" in error_line(capsys, "evaluate", "--methods", "taau", "-o", tmp_path / "out")
+
+
+def test_upscale_without_weights(capsys, sequence, tmp_path, monkeypatch):
+    monkeypatch.setattr("jaxsr.evaluation.run.weights_folder", lambda: tmp_path / "none")
+    line = error_line(capsys, "upscale", sequence.path, "--method", "fusion-sr", "-o", tmp_path / "out")
+    assert "no weights of 'fusion-sr' for scale 2; found no weights of it in the package" in line
+    assert not (tmp_path / "out").exists()
 
 
 def test_inspect_finds_what_is_wrong_with_the_pixels(capsys, sequence):

@@ -13,7 +13,7 @@ from jaxsr.evaluation.upscale import upscale
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.images import read_png
 from jaxsr.methods import METHODS
-from tests.builders import make_sequence
+from tests.builders import make_sequence, random_weights
 
 
 def _silent(title, total):
@@ -24,17 +24,20 @@ def _silent(title, total):
 def demo(tmp_path_factory):
     root = tmp_path_factory.mktemp("demo")
     sequences = [make_sequence(root / name, frames=4).path for name in ("one-test-0", "two-test-0")]
+    random_weights(root / "weights" / "fusion-sr-x2.safetensors", scale=2)
     steps = []
-    sections = run_demo(
-        root / "out", sequences, scale=2, progress=lambda title, total: lambda: steps.append(title)
-    )
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("jaxsr.evaluation.run.weights_folder", lambda: root / "weights")
+        sections = run_demo(
+            root / "out", sequences, scale=2, progress=lambda title, total: lambda: steps.append(title)
+        )
     return root / "out", sections, steps
 
 
 def test_the_demo_writes_frames_videos_metrics_and_a_page(demo):
     out, sections, steps = demo
     assert len(sections) == 4
-    assert steps.count("frames") == 2 * 2 * 4 * (5 + 5)
+    assert steps.count("frames") == 2 * 2 * 4 * (6 + 5)  # made and measured, sequences, frames, methods
     for name in ("one-test-0", "two-test-0"):
         for task in ("super-resolution", "extrapolation"):
             assert (out / f"{name}-{task}.mp4").stat().st_size > 1000
@@ -80,7 +83,9 @@ def test_truth_is_never_seen(name, tmp_path):
         nan = {k: np.full_like(v, np.nan) for k, v in channels.items() if k.startswith("color.")}
         assert len(nan) == 3
         write_exr(file, channels | nan, metadata)
-    method = find_method(name)
+    learned = METHODS[name].new_net is not None
+    given = random_weights(tmp_path / f"{name}.safetensors", scale=2, method=name) if learned else name
+    method = find_method(str(given), 2)
     for sequence, out in ((clean, "a"), (poisoned, "b")):
         upscale(sequence, method, tmp_path / out, scale=2, every=2)
     files = sorted(p.relative_to(tmp_path / "a") for p in (tmp_path / "a").rglob("*.*"))
@@ -124,7 +129,7 @@ def test_frames_of_two_sequences_do_not_mix(tmp_path):
     short = make_sequence(tmp_path / "short", frames=2)
     upscale(long, find_method("nearest", 2), tmp_path / "out", scale=2)
     with pytest.raises(JaxsrError, match=r"holds 0003.exr, which is not a frame of this sequence"):
-        upscale(short, find_method("nearest"), tmp_path / "out", scale=2)
+        upscale(short, find_method("nearest", 2), tmp_path / "out", scale=2)
 
 
 def test_a_moving_camera_without_motion_is_an_error(tmp_path):

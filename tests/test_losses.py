@@ -92,7 +92,7 @@ def test_ssim_is_the_loop_and_the_metric(size, seed):
 
 def test_known_values():
     black, grey = jnp.zeros((1, 16, 16, 3)), jnp.full((1, 16, 16, 3), 0.5)
-    assert _of(losses.charbonnier, black, black) == pytest.approx(1e-3)
+    assert _of(losses.charbonnier, black, black) == pytest.approx(1e-3, rel=1e-5)
     assert _of(losses.charbonnier, grey, black) == pytest.approx((0.25 + 1e-6) ** 0.5)
     assert _of(losses.census, grey, black) == pytest.approx(0, abs=1e-7)  # a shift in brightness
     assert _of(losses.temporal_l1, grey, black) == pytest.approx(0.5)
@@ -180,7 +180,7 @@ def test_no_holes_have_no_gradient():
     np.testing.assert_array_equal(gradient, 0)
 
 
-@pytest.mark.parametrize("name", ["charbonnier", "census", "feature_census", "ssim_loss"])
+@pytest.mark.parametrize("name", ["census", "feature_census", "ssim_loss"])
 def test_gradients_are_the_slopes(name):
     pred, target = _images(6, 1, 12, 13, 3)
     # Scaled: a mean over so many pixels has a slope too small for single precision.
@@ -193,6 +193,12 @@ def test_gradients_are_the_slopes(name):
         rtol=2e-2,
         eps=1e-2,
     )
+
+
+def test_the_gradient_of_charbonnier_turns_within_a_thousandth():
+    d = jnp.array([-0.5, -1e-3, -1e-5, 0.0, 1e-3, 0.2])[None, :, None]
+    gradient = jax.grad(losses.charbonnier)(0.3 + d, jnp.full_like(d, 0.3))
+    np.testing.assert_allclose(6 * gradient, d / np.sqrt(d * d + 1e-6), atol=1e-4)
 
 
 @given(seed=st.integers(0, 10**6))

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsr import metrics
+from jaxsr import metrics, perceptual
 from jaxsr.errors import JaxsrError
+
+needs_lpips = pytest.mark.skipif(not perceptual.installed(), reason="needs the extra `perceptual`")
 
 
 def pair(h, w):
@@ -145,12 +147,82 @@ def test_temporal_psnr_starts_over_at_cuts():
 def test_measure_has_every_metric_for_every_frame():
     image, truth = pair(24, 24)
     found = metrics.measure([image, truth, image], [truth] * 3)
-    assert set(found) == set(metrics.METRICS)
+    assert tuple(found) == metrics.available()
     assert all(len(values) == 3 for values in found.values())
     assert found["psnr"][1] == math.inf
     assert found["tpsnr"][0] is None
     tiny = np.zeros((4, 4, 3), np.float32)
-    assert metrics.measure([tiny], [tiny])["ssim"] == [None]
+    small = metrics.measure([tiny], [tiny])
+    assert small["ssim"] == [None]
+    assert small.get("lpips", [None]) == [None]
+
+
+def test_lpips_is_left_out_where_its_extra_is_absent(monkeypatch):
+    monkeypatch.setattr("jaxsr.perceptual.installed", lambda: False)
+    image, truth = pair(24, 24)
+    assert metrics.available() == ("psnr", "ssim", "flip", "tpsnr")
+    assert list(metrics.measure([image], [truth])) == ["psnr", "ssim", "flip", "tpsnr"]
+
+
+def test_regions_of_a_frame_are_the_metrics_over_masks():
+    image, truth = pair(24, 32)
+    before = pair(24, 32)[0][::-1], truth
+    left, border, none = (np.zeros((24, 32), bool) for _ in range(3))
+    left[:, :20] = True
+    border[:3] = True
+    keys = ("psnr", "ssim", "flip", "tpsnr")
+    regions = {"left": left, "border": border, "none": none}
+    found = metrics.measure_frame(image, truth, before=before, regions=regions, keys=keys)
+    assert list(found) == ["all", "left", "border", "none"]
+    for region, mask in (("all", None), ("left", left)):
+        assert found[region] == {
+            "psnr": metrics.psnr(image, truth, mask),
+            "ssim": metrics.ssim(image, truth, mask),
+            "flip": metrics.flip(image, truth, mask),
+            "tpsnr": metrics.temporal_psnr([before[0], image], [truth, truth], mask)[1],
+        }
+    assert found["border"]["ssim"] is None  # no window lies inside the image there
+    assert found["border"]["psnr"] == metrics.psnr(image, truth, border)
+    assert found["none"] == dict.fromkeys(keys)
+    made = metrics.measure_frame(image, truth, flip_error=np.full((24, 32), 0.25, np.float32), keys=["flip"])
+    assert made == {"all": {"flip": 0.25}}
+
+
+@needs_lpips
+def test_lpips_of_a_region_is_the_mean_of_its_map():
+    image, truth = pair(40, 40)
+    half = truth.copy()
+    half[:, 20:] = image[:, 20:]
+    left = np.zeros((40, 40), bool)
+    left[:, :20] = True
+    found = metrics.measure_frame(half, truth, regions={"left": left, "right": ~left}, keys=["lpips"])
+    assert found["all"]["lpips"] == pytest.approx(metrics.lpips(half, truth), rel=1e-4)
+    assert found["left"]["lpips"] == pytest.approx(metrics.lpips(half, truth, left), rel=1e-4)
+    assert found["left"]["lpips"] < found["right"]["lpips"]
+    assert metrics.lpips(truth, truth) == pytest.approx(0, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"keys": ["vmaf"]}, "unknown metric 'vmaf'; expected psnr"),
+        ({"regions": {"all": np.ones((16, 16), bool)}}, "a region is named 'all'"),
+        ({"regions": {"r": np.ones((8, 16), bool)}}, "mask has the wrong size"),
+        ({"before": (np.zeros((8, 8, 3), np.float32),) * 2, "keys": ["tpsnr"]}, "frames differ in size"),
+    ],
+)
+def test_bad_arguments_of_a_frame(arguments, words):
+    image, truth = pair(16, 16)
+    with pytest.raises(JaxsrError, match=words):
+        metrics.measure_frame.__wrapped__(image, truth, **arguments)
+
+
+def test_asking_for_lpips_without_its_extra(monkeypatch):
+    monkeypatch.setattr("jaxsr.perceptual._folder", lambda: None)
+    perceptual._load.cache_clear()
+    image, truth = pair(16, 16)
+    with pytest.raises(JaxsrError, match=r"pip install 'jaxsr\[perceptual\]'"):
+        metrics.measure_frame(image, truth, keys=["lpips"])
 
 
 def broken(kind):

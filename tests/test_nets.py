@@ -11,7 +11,8 @@ from flax import nnx
 
 from jaxsr.errors import JaxsrError
 from jaxsr.nets import FusionSR, UNetSR
-from jaxsr.nets.layers import ShallowFeatures, UpConv, conv, conv_beside
+from jaxsr.nets.layers import ShallowFeatures, UpConcat, UpConv, conv, conv_beside
+from tests.networks import drawn
 
 NETS = {"fusion": FusionSR, "unet": UNetSR}
 
@@ -73,20 +74,20 @@ def test_the_paper_s_widths():
 
 
 def test_kernels_are_xavier_uniform_and_biases_zero():
-    net = FusionSR(rngs=nnx.Rngs(0))
-    kernel = np.asarray(net.decoder2.convs.conv1.kernel[...])
+    net = UpConcat(128, 64, 64, 64, dtype=jnp.float32, rngs=nnx.Rngs(0))
+    kernel = np.asarray(net.convs.conv1.kernel[...])
     bound = np.sqrt(6 / (9 * (128 + 64)))
     assert 0.98 * bound < np.abs(kernel).max() <= bound
     assert abs(kernel.std() - bound / np.sqrt(3)) < 0.01 * bound
-    assert not np.any(net.decoder2.up.bias[...])
+    assert not np.any(net.up.bias[...])
 
 
 @pytest.mark.parametrize("name", NETS)
 @pytest.mark.parametrize(("size", "scale"), [((3, 5), 4), ((3, 5), 2), ((1, 1), 2), ((2, 3), 3)])
 def test_any_size_and_scale(name, size, scale):
-    net = _abstract(NETS[name])
-    color, gbuffer = _inputs(size=size, scale=scale)
-    out = jax.eval_shape(net, color, gbuffer, jnp.zeros((1, 2), jnp.int32))
+    graph, state = nnx.split(_abstract(NETS[name]))
+    inputs = *_inputs(size=size, scale=scale), jnp.zeros((1, 2), jnp.int32)
+    out = jax.eval_shape(lambda state, *inputs: nnx.merge(graph, state)(*inputs), state, *inputs)
     assert out.shape == (1, size[0] * scale, size[1] * scale, 3)
     assert out.dtype == jnp.float32
 
@@ -95,7 +96,7 @@ def test_any_size_and_scale(name, size, scale):
     "make", [functools.partial(UNetSR, scale=2), functools.partial(FusionSR, scale=2, fusion="add")]
 )
 def test_padding_repeats_the_border(make):
-    run, state = _pure(make(rngs=nnx.Rngs(0)))
+    run, state = _pure(drawn(make))
     color, gbuffer = _inputs(size=(3, 4), scale=2)
     padded = [
         jnp.pad(x, ((0, 0), (0, n), (0, 0), (0, 0)), mode="edge") for x, n in ((color, 1), (gbuffer, 2))
@@ -105,7 +106,7 @@ def test_padding_repeats_the_border(make):
 
 @pytest.mark.parametrize("name", NETS)
 def test_jit_is_eager_and_batches_are_images(name):
-    net = NETS[name](down_kernel=2, buffers=("normal", "depth"), rngs=nnx.Rngs(1))
+    net = drawn(functools.partial(NETS[name], down_kernel=2, buffers=("normal", "depth")), 1)
     run, state = _pure(net)
     color, gbuffer = _inputs(1, batch=2, size=(2, 3), scale=2, channels=4)
     batch = run(state, color, gbuffer)
@@ -117,7 +118,7 @@ def test_jit_is_eager_and_batches_are_images(name):
 
 @pytest.mark.parametrize("name", NETS)
 def test_offset_places_the_samples(name):
-    run, state = _pure(NETS[name](rngs=nnx.Rngs(2)))
+    run, state = _pure(drawn(NETS[name], 2))
     color, gbuffer = _inputs(2, batch=2)
     topleft = run(state, color, gbuffer)
     np.testing.assert_array_equal(topleft, run(state, color, gbuffer, jnp.zeros((2, 2), jnp.int32)))
@@ -129,7 +130,7 @@ def test_offset_places_the_samples(name):
 def test_offset_shifts_the_output():
     # Away from the borders a shift of samples and G-buffer together is a shift of the picture. Without
     # squeeze-and-excitation, which sees the borders too, and by whole cells of the coarsest level.
-    run, state = _pure(FusionSR(fusion="concat", scale=8, rngs=nnx.Rngs(3)))
+    run, state = _pure(drawn(functools.partial(FusionSR, fusion="concat", scale=8), 3))
     color, gbuffer = _inputs(3, size=(8, 8), scale=8)
     color, gbuffer = color.at[:, :3].set(0.5).at[:, -3:].set(0.5), jnp.full_like(gbuffer, 0.3)
     topleft, moved = run(state, color, gbuffer), run(state, color, gbuffer, jnp.array([[0, 4]]))
@@ -138,7 +139,7 @@ def test_offset_shifts_the_output():
 
 
 def test_batch_norm_trains_by_batch_and_infers_by_its_running_mean():
-    net = FusionSR(rngs=nnx.Rngs(0))
+    net = drawn(FusionSR)
     norm = net.fusions[0].norm1
     assert (norm.momentum, norm.epsilon) == (0.9, 1e-5)
     color, gbuffer = _inputs(4, batch=2)
@@ -166,14 +167,14 @@ def test_batch_norm_trains_by_batch_and_infers_by_its_running_mean():
     # Inference does not depend on the rest of the batch.
     np.testing.assert_allclose(run(state, color[:1], gbuffer[:1])[0], inferred[0], atol=1e-5)
     # After many steps on one batch the running statistics are that batch's.
-    for _ in range(60):
+    for _ in range(200):
         last, after = train(after)
-    np.testing.assert_allclose(run(after, color, gbuffer), last, atol=0.02 * float(np.abs(last).max()))
+    np.testing.assert_allclose(run(after, color, gbuffer), last, atol=1e-3)
 
 
 @pytest.mark.parametrize("make", [FusionSR, functools.partial(UNetSR, down_kernel=2)])
 def test_gradients_are_finite_and_reach_everything(make):
-    graph, params, rest = nnx.split(make(rngs=nnx.Rngs(5)), nnx.Param, ...)
+    graph, params, rest = nnx.split(drawn(make, 5), nnx.Param, ...)
     color, gbuffer = _inputs(5, batch=2, size=(3, 3))
     color = color.at[0].set(0)  # a black frame
 
@@ -193,8 +194,8 @@ def test_gradients_are_finite_and_reach_everything(make):
 @pytest.mark.parametrize("name", NETS)
 def test_bfloat16_computes_close_by(name):
     color, gbuffer = _inputs(6)
-    run, state = _pure(NETS[name](rngs=nnx.Rngs(6)))
-    run_half, half = _pure(NETS[name](dtype=jnp.bfloat16, rngs=nnx.Rngs(6)))
+    run, state = _pure(drawn(NETS[name], 6))
+    run_half, half = _pure(drawn(functools.partial(NETS[name], dtype=jnp.bfloat16), 6))
     assert all(x.dtype == jnp.float32 for x in jax.tree.leaves(half))
     exact, close = run(state, color, gbuffer), run_half(half, color, gbuffer)
     assert close.dtype == jnp.float32
@@ -203,7 +204,8 @@ def test_bfloat16_computes_close_by(name):
 
 
 def test_bfloat16_trains():
-    graph, params, rest = nnx.split(FusionSR(dtype=jnp.bfloat16, rngs=nnx.Rngs(6)), nnx.Param, ...)
+    net = drawn(functools.partial(FusionSR, dtype=jnp.bfloat16), 6)
+    graph, params, rest = nnx.split(net, nnx.Param, ...)
     color, gbuffer = _inputs(6)
     grads = jax.jit(jax.grad(lambda p: jnp.mean(nnx.merge(graph, p, rest, copy=True)(color, gbuffer))))(
         params
@@ -217,7 +219,7 @@ def test_it_learns_one_image(make):
     truth = jnp.stack([x, y, (x > 0.5).astype(jnp.float32)], -1)[None]
     gbuffer = jnp.concatenate([truth, jnp.zeros((1, 8, 8, 1))], -1)
     color = truth[:, ::4, ::4]
-    net = make(buffers=("base_color", "depth"), rngs=nnx.Rngs(0))
+    net = drawn(functools.partial(make, buffers=("base_color", "depth")))
     graph, params, rest = nnx.split(net, nnx.Param, ...)
     optimizer = optax.adam(3e-3)
 
@@ -229,7 +231,8 @@ def test_it_learns_one_image(make):
             return error, nnx.state(net, nnx.Not(nnx.Param))
 
         (error, rest), grads = jax.value_and_grad(loss, has_aux=True)(params)
-        updates, opt = optimizer.update(grads, opt)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers with floats
+            updates, opt = optimizer.update(grads, opt)
         return optax.apply_updates(params, updates), rest, opt, error
 
     opt = optimizer.init(params)
@@ -262,8 +265,7 @@ def test_shallow_features_keep_the_input():
 
 
 def test_size_of_the_export_may_be_open():
-    net = UNetSR(scale=4, rngs=nnx.Rngs(0))
-    run, state = _pure(net)
+    run, state = _pure(drawn(functools.partial(UNetSR, scale=4)))
     h, w = jax.export.symbolic_shape("h, w")
     shapes = [jax.ShapeDtypeStruct((1, *size), jnp.float32) for size in ((h, w, 3), (4 * h, 4 * w, 9))]
     exported = jax.export.export(jax.jit(lambda c, g: run(state, c, g)))(*shapes)

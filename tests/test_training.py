@@ -1,8 +1,10 @@
 """Training: the same to the bit however often it is killed, on two devices as on one, and clear errors."""
 
 import contextlib
+import dataclasses
 import json
 import os
+import resource
 import shutil
 import signal
 import subprocess
@@ -36,7 +38,7 @@ ROOT = Path(__file__).parents[1]
 def data(tmp_path_factory):
     """A folder with one sequence of five frames."""
     folder = tmp_path_factory.mktemp("train") / "data"
-    make_sequence(folder / "clip", frames=5)
+    make_sequence(folder / "clip", frames=5, scales=(2, 4))
     return folder
 
 
@@ -74,7 +76,7 @@ def assert_same(a: Path, b: Path) -> None:
 def test_what_is_written(whole):
     assert rows(whole)[-1]["step"] == "12"
     steps = [int(row["step"]) for row in rows(whole) if row["eval/psnr"]]
-    assert steps == [4, 8, 12]
+    assert steps == [0, 4, 8, 12]
     for step in steps:
         assert read_png(whole / "pictures" / f"step-{step:06d}.png").shape == (40, 3 * 64, 3)
     assert (whole / "loss.png").stat().st_size > 1000
@@ -94,7 +96,7 @@ def test_the_loss_falls(data, tmp_path):
     tiny_method.train(
         data, tmp_path / "out", steps=60, eval_every=60, save_every=60, learning_rate=3e-3, ema=0
     )
-    losses = [float(row["loss"]) for row in rows(tmp_path / "out")]
+    losses = [float(row["loss"]) for row in rows(tmp_path / "out") if row["loss"]]
     assert losses[-1] < 0.7 * losses[0]
 
 
@@ -227,6 +229,44 @@ def test_fine_tuning_starts_from_the_weights(whole, data, tmp_path):
     np.testing.assert_allclose(new["conv1.kernel"], old["conv1.kernel"], atol=1e-7)
 
 
+def test_fine_tuning_at_another_scale(whole, data, tmp_path):
+    """Nothing in the weights depends on the scale."""
+    options = {"steps": 1, "init": whole / "weights.safetensors", "scale": 4, "learning_rate": 1e-9}
+    tiny_method.train(data, tmp_path / "out", **options)
+    arrays, header = load_weights(tmp_path / "out" / "weights.safetensors")
+    assert header["scale"] == 4
+    assert header["training"]["config"]["init"] == "weights.safetensors"
+    np.testing.assert_allclose(
+        arrays["conv1.kernel"], load_weights(whole / "weights.safetensors")[0]["conv1.kernel"], atol=1e-7
+    )
+
+
+def test_weights_of_other_options_are_noted(data, tmp_path, capsys):
+    """Shapes can fit where the meaning does not."""
+    old = tiny_method.method()._replace(arguments={"color": "display", "buffers": ["depth"], "gone": 1})
+    new = old._replace(arguments={"color": "lighting", "buffers": ("depth",)})
+    config = TrainConfig(data=(data,), out=tmp_path / "old", cache=data.parent / "cache", scale=2, crop=16)
+    config = dataclasses.replace(config, steps=1, batch=2)
+    file = train_method(old, config, quiet=True)
+    train_method(new, dataclasses.replace(config, out=tmp_path / "new", init=file))
+    assert "weights.safetensors was made with other options: color display -> lighting\n" in (
+        capsys.readouterr().err
+    )
+
+
+def test_the_sample_is_the_default(data, tmp_path):
+    """Its training frames are unpacked into the cache, once."""
+    out, cache = tmp_path / "out", tmp_path / "cache"
+    options = {"data": (), "cache": cache, "scale": 4, "crop": 16, "steps": 1, "eval_every": 5}
+    tiny_method.train(data, out, **options)
+    names = [text.split()[0] for text in json.loads((out / "config.json").read_text())["sequences"]]
+    assert names == ["bunker-train-0", "docks-train-0", "forest-train-0"]
+    (sample,) = cache.glob("sample-*")
+    first = next(sample.glob("*/hr/*.exr")).stat().st_mtime_ns
+    tiny_method.train(data, out, **options)
+    assert next(sample.glob("*/hr/*.exr")).stat().st_mtime_ns == first
+
+
 def test_the_last_frame_is_held_back(data, whole):
     shared = {"scale": 2, "held_back": 1, "cache": data.parent / "cache", "needs": tiny_method.method().needs}
     loader = make_loader([data], crop=16, **shared)
@@ -356,6 +396,31 @@ class TestErrors:
             train_method(tiny_method.method(loss), config, quiet=True)
         assert (tmp_path / "out" / "checkpoints" / "4").is_dir()
 
+    @pytest.mark.parametrize("bytes_", [100, 1000, 3000, 30_000])
+    def test_no_room(self, whole, data, tmp_path, bytes_, capfd):
+        """No file may grow larger: one line says which; with room again it goes on as if nothing had been."""
+        soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (bytes_, hard))
+            with pytest.raises(JaxsrError, match=r"out/.*cannot be written|out/.*cannot write") as error:
+                tiny_method.train(data, tmp_path / "out")
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+        assert "File too large" in str(error.value)
+        assert "Traceback" not in capfd.readouterr().err
+        tiny_method.train(data, tmp_path / "out")
+        assert_same(tmp_path / "out", whole)
+
+    def test_without_lpips(self, capsys, tmp_path, monkeypatch):
+        """At once: nothing was unpacked or converted."""
+        monkeypatch.setattr("jaxsr.perceptual.installed", lambda: False)
+        line = error_line(
+            capsys, "train", "fusion-sr", "--out", tmp_path / "out", "--cache", tmp_path / "cache"
+        )
+        assert "jaxsr[perceptual]" in line
+        assert "--perceptual-weight 0" in line
+        assert not list(tmp_path.iterdir())
+
     def test_two_at_once(self, whole, data, tmp_path):
         with loop._only_one(whole), pytest.raises(JaxsrError, match="another process trains"):
             tiny_method.train(data, whole)
@@ -463,6 +528,7 @@ def test_command_line(capsys, data, tmp_path):
     """`jaxsr train fusion-sr`, and the same command again."""
     options = ["--data", data, "--out", tmp_path / "out", "--cache", tmp_path, "--scale", 2, "--steps", 2]
     options += ["--crop", 16, "--batch", 2, "--perceptual-weight", 0, "--fusion", "add"]
+    options += ["--compute", "bfloat16"]
     status, out, err = run(capsys, "train", "fusion-sr", *options)
     assert status == 0, err
     assert "jaxsr upscale SEQ --method" in out

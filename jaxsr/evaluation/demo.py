@@ -2,7 +2,7 @@
 
 import platform
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,13 +44,13 @@ def run_demo(
     sequences: Sequence[Path],
     *,
     scale: int,
-    lpips: Collection[str] = ("super-resolution",),
+    lpips: bool = False,
     progress: Callable[[str, int], Callable[[], Any]],
 ) -> list[Section]:
     """Run the demo and write frames, videos, metrics and the page into `out`.
 
     Args:
-        lpips: tasks in which LPIPS is measured where its extra is installed; it costs more than all the rest.
+        lpips: measure LPIPS too, if its extra is installed; it takes longer than all the rest.
         progress: called with a title and a number of steps; returns what is called after each step.
 
     Raises:
@@ -74,7 +74,7 @@ def run_demo(
                     sequence,
                     [find_method(name, scale) for name in task.methods],
                     out / sequence.name / task.name,
-                    Settings(scale, task.every, metrics=metrics_with(task.name in lpips)),
+                    Settings(scale, task.every, metrics=metrics_with(lpips)),
                     reference=reference,
                     advance=advance,
                     compiled=compiled,

@@ -33,7 +33,8 @@ def _edges(depth: Array) -> Array:
     for v in (inverse, inverse.T):
         before, middle, after = v[:-2], v[1:-1], v[2:]
         largest = jnp.maximum(jnp.maximum(before, after), middle)
-        found.append(jnp.pad(jnp.abs(before + after - 2 * middle) > BEND * largest, ((1, 1), (0, 0))))
+        bent = jnp.abs(before + after - 2 * middle) > BEND * largest
+        found.append(jnp.zeros(v.shape, bool).at[1:-1].set(bent))
     return found[0] | found[1].T
 
 

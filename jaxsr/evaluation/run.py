@@ -31,7 +31,7 @@ class Ready(NamedTuple):
     """A method with all it needs to run."""
 
     method: Method
-    """Named as it was asked for: a file of weights gives its own name."""
+    """Named as it was asked for; a file of weights gives its name, or that of its folder (`weights_name`)."""
     net: Net = None
     """Of a network, its state; None where nothing is learned."""
     weights: Path | None = None
@@ -65,6 +65,14 @@ def shipped_scales(name: str) -> list[int]:
     return sorted(int(match[1]) for match in found if match)
 
 
+def weights_name(path: Path) -> str:
+    """What a file of weights is called: those that `jaxsr train` writes go by the name of their folder."""
+    if path.stem not in ("weights", "best"):
+        return path.stem
+    folder = path.resolve().parent.name
+    return folder if path.stem == "weights" else f"{folder}-{path.stem}"
+
+
 def find_method(name: str, scale: int) -> Ready:
     """The method of that name, or of a file of weights.
 
@@ -79,7 +87,7 @@ def find_method(name: str, scale: int) -> Ready:
     """
     if name.endswith(".safetensors"):
         path = Path(name)
-        return _with_weights(path.stem, path, scale)
+        return _with_weights(weights_name(path), path, scale)
     scales = shipped_scales(name)
     if scale in scales:
         return _with_weights(name, weights_folder() / f"{name}-x{scale}.safetensors", scale)
@@ -101,7 +109,14 @@ def find_method(name: str, scale: int) -> Ready:
 
 def _with_weights(name: str, path: Path, scale: int) -> Ready:
     arrays, header = load_weights(path)
-    trained = header.get("scale")
+    trained, arguments = header.get("scale"), header.get("arguments", {})
+    if not isinstance(trained, int) or not isinstance(arguments, dict):
+        raise JaxsrError(
+            "the header of the weights is damaged",
+            where=path,
+            expected="a whole number as scale, an object as arguments",
+            found=f"scale {trained}, arguments {arguments}",
+        )
     if trained != scale:
         raise JaxsrError(
             "the weights are made for another scale",
@@ -110,7 +125,7 @@ def _with_weights(name: str, path: Path, scale: int) -> Ready:
             found=f"scale {trained}",
             fix=f"choose --scale {trained}, or other weights",
         )
-    method = build(header.get("method", ""), header.get("arguments", {}))
+    method = build(str(header["method"]), arguments)
     assert method.new_net is not None  # `build` knows only methods that learn
     new_net = method.new_net
     empty = nnx.state(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))))

@@ -6,6 +6,8 @@ storages only, puts inert records in the place of the last two, and refuses ever
 looked up. Names and layouts stay the publisher's: `jaxsr.nets.published` translates.
 """
 
+import io
+import math
 import pickle
 import zipfile
 from collections import OrderedDict
@@ -101,9 +103,14 @@ class _Tensor(NamedTuple):
     metadata: Any = None
 
 
+def _tensor(*arguments: Any) -> _Tensor:
+    """Not the class itself: a pickle may set attributes of what it names."""
+    return _Tensor(*arguments)
+
+
 _ALLOWED = {
     ("collections", "OrderedDict"): OrderedDict,
-    ("torch._utils", "_rebuild_tensor_v2"): _Tensor,
+    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
     **{("torch", name): _Storage(np.dtype(dtype)) for name, dtype in _STORAGES.items()},
 }
 
@@ -149,8 +156,8 @@ def _read_pth(path: Path) -> dict[str, np.ndarray]:
                 and _member(archive, f"{folder}byteorder") == b"big"
             ):
                 raise ValueError("big-endian numbers")
-            with archive.open(pickles[0]) as file:
-                state = _state_dict(_Unpickler(file, path).load(), path)
+            content = _Unpickler(io.BytesIO(_member(archive, pickles[0])), path).load()
+            state = _state_dict(content, path)
             storages: dict[str, np.ndarray] = {}
             return {name: _array(tensor, archive, folder, storages) for name, tensor in state.items()}
     except JaxsrError:
@@ -200,7 +207,7 @@ def _array(
     if len(size) != len(stride) or min((tensor.offset, *size, *stride), default=0) < 0:
         raise ValueError("a tensor of impossible layout")
     last = tensor.offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    if 0 not in size and last >= flat.size:
+    if 0 not in size and max(last + 1, math.prod(size)) > flat.size:  # a step of 0 repeats without end
         raise ValueError("a tensor that is larger than its storage")
     window = flat[tensor.offset :] if 0 not in size else flat[:0]
     view = np.lib.stride_tricks.as_strided(window, size, [step * dtype.itemsize for step in stride])

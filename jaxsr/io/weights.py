@@ -9,7 +9,7 @@ size; loaded, they are float32 either way. `jaxsr.io.published` reads the weight
 import json
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import jax.numpy as jnp
 import numpy as np
@@ -20,11 +20,13 @@ from safetensors.numpy import save
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import atomic_path
 
+State: TypeAlias = Any
+"""An `nnx.State`; not annotated as one, for its own annotations are of a kind that beartype rejects."""
 KEY = "jaxsr"
 """Of the metadata entry that holds the header."""
 
 
-def flatten(state: nnx.State) -> dict[str, np.ndarray]:
+def flatten(state: State) -> dict[str, np.ndarray]:
     """The arrays of a state by name, "a.b.c" for `state["a"]["b"]["c"]`."""
     return {
         ".".join(map(str, path)): np.asarray(variable.get_value())
@@ -34,7 +36,7 @@ def flatten(state: nnx.State) -> dict[str, np.ndarray]:
 
 def save_weights(
     path: str | Path,
-    state: nnx.State | Mapping[str, np.ndarray],
+    state: State | Mapping[str, np.ndarray],
     header: Mapping[str, Any],
     half: bool = False,
 ) -> None:
@@ -131,7 +133,7 @@ def check_file(path: Path) -> None:
         )
 
 
-def into(state: nnx.State, arrays: Mapping[str, np.ndarray], where: object = "weights") -> nnx.State:
+def into(state: State, arrays: Mapping[str, np.ndarray], where: object = "weights") -> State:
     """A state like `state`, with these arrays as its values.
 
     Args:

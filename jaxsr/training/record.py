@@ -3,11 +3,14 @@
 All of it begins again where a resumed training does: rows and events past its checkpoint are dropped.
 """
 
+import contextlib
 import csv
 import io
 import math
+import os
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -31,13 +34,11 @@ class Log:
     """
 
     def __init__(self, out: Path, step: int):
-        from tensorboardX import SummaryWriter
-
         self._out, self._file = out, out / "log.csv"
-        self.rows = [row for row in _read(self._file) if row["step"] <= step]
+        self.rows = [row for row in _read(self._file) if row["step"] <= step and step]
         self._columns = list(dict.fromkeys(name for row in self.rows for name in row))
         self._rewrite()
-        self._board = SummaryWriter(str(out / "tensorboard"), purge_step=step + 1 if step else None)
+        self._board = _Board(out / "tensorboard", step)
 
     def add(self, row: dict[str, float]) -> None:
         """One more row; "step" is among its numbers."""
@@ -47,16 +48,14 @@ class Log:
         if new:
             self._rewrite()
         else:
-            with self._file.open("a", encoding="utf-8", newline="") as file:
+            with _told(self._file), self._file.open("a", encoding="utf-8", newline="") as file:
                 self._writer(file).writerow(row)
-        for name, value in row.items():
-            if name != "step":
-                self._board.add_scalar(name, value, int(row["step"]))
+        self._board.scalars({name: value for name, value in row.items() if name != "step"}, int(row["step"]))
 
     def picture(self, image: Float[np.ndarray, "h w 3"], step: int) -> None:
         """`pictures/step-000500.png`, and the same in TensorBoard."""
         write_png(self._out / "pictures" / f"step-{step:06d}.png", image)
-        self._board.add_image("input, network, truth", image, step, dataformats="HWC")
+        self._board.image("input, network, truth", image, step)
 
     def curve(self) -> None:
         """`loss.png`: the loss, and the PSNR of the evaluations, over the steps."""
@@ -67,7 +66,7 @@ class Log:
         self._board.flush()
 
     def close(self) -> None:
-        """End TensorBoard's thread."""
+        """Close TensorBoard's file."""
         self._board.close()
 
     def _writer(self, file: Any) -> csv.DictWriter:
@@ -81,6 +80,52 @@ class Log:
         writer.writerows(self.rows)
         with atomic_path(self._file) as temporary:
             temporary.write_text(text.getvalue(), encoding="utf-8")
+
+
+class _Board:
+    """TensorBoard's file. tensorboardX's own writer is a thread: a full disk ends it, and we wait forever."""
+
+    def __init__(self, folder: Path, step: int):
+        from tensorboardX.event_file_writer import EventsWriter
+        from tensorboardX.proto import event_pb2
+
+        self._folder, self._event = folder, event_pb2.Event
+        with _told(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+            self._file = EventsWriter(str(folder / "events"), f".{os.getpid()}-{step}")
+        if step:  # drops what other files say of later steps
+            self._add(step + 1, session_log=event_pb2.SessionLog(status=event_pb2.SessionLog.START))
+
+    def _add(self, step: int, **content: Any) -> None:
+        with _told(self._folder):
+            self._file.write_event(self._event(step=step, wall_time=time.time(), **content))
+
+    def scalars(self, values: dict[str, float], step: int) -> None:
+        from tensorboardX.summary import scalar
+
+        for name, value in values.items():
+            self._add(step, summary=scalar(name, value))
+
+    def image(self, name: str, image: np.ndarray, step: int) -> None:
+        from tensorboardX.summary import image as summary
+
+        self._add(step, summary=summary(name, image, dataformats="HWC"))
+
+    def flush(self) -> None:
+        with _told(self._folder):
+            self._file.flush()
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):  # `flush` would have said so
+            self._file.close()
+
+
+@contextlib.contextmanager
+def _told(where: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as e:
+        raise JaxsrError("cannot write", where=where, found=e.strerror or e, fix="check the folder") from e
 
 
 def _read(file: Path) -> list[dict[str, float]]:

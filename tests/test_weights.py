@@ -1,0 +1,472 @@
+"""Files of weights, ours and published ones: exact, and nothing in them runs."""
+
+import functools
+import json
+import pickle
+import zipfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from flax import nnx
+from safetensors.numpy import save_file
+
+import jaxsr
+from jaxsr.convert import convert_published
+from jaxsr.errors import JaxsrError
+from jaxsr.io.published import read_published
+from jaxsr.io.weights import flatten, into, load_weights, save_weights
+from jaxsr.methods import build
+from jaxsr.nets import FusionSR, UNetSR
+from jaxsr.nets.fusion_sr import Fusion
+from jaxsr.nets.published import PUBLISHED
+from tests.networks import drawn
+from tests.test_cli import error_line, run
+
+GOLDENS = Path(__file__).parents[2] / "shared" / "goldens"
+HEADER = {"method": "fusion-sr", "arguments": {"fusion": "add"}, "scale": 4, "trained": [1, "ä"]}
+
+
+def block(*, rngs):
+    """A part of a network that has every kind of array."""
+    return Fusion(16, dtype=jnp.float32, rngs=rngs)
+
+
+@pytest.fixture
+def state():
+    return nnx.state(drawn(block))
+
+
+@pytest.fixture
+def arrays(state):
+    return flatten(state)
+
+
+def test_roundtrip_is_exact(tmp_path, state):
+    path = tmp_path / "weights.safetensors"
+    save_weights(path, state, HEADER)
+    arrays, header = load_weights(path)
+    assert header == HEADER
+    abstract = nnx.state(nnx.eval_shape(lambda: block(rngs=nnx.Rngs(0))))
+    again = into(abstract, arrays, path)
+    assert jax.tree.structure(again) == jax.tree.structure(state)
+    jax.tree.map(np.testing.assert_array_equal, again, state)
+    first = path.read_bytes()
+    save_weights(path, again, dict(reversed(HEADER.items())))
+    assert path.read_bytes() == first
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_names_are_places_in_the_network(arrays):
+    assert "se.squeeze.kernel" in arrays
+    assert {k for k in arrays if k.startswith("norm1.")} == {
+        f"norm1.{k}" for k in ("scale", "bias", "mean", "var")
+    }
+
+
+def test_half_is_half_the_size_and_rounded(tmp_path, arrays):
+    whole, half = tmp_path / "whole.safetensors", tmp_path / "half.safetensors"
+    save_weights(whole, arrays, HEADER)
+    save_weights(half, arrays, HEADER, half=True)
+    saved = whole.stat().st_size - half.stat().st_size
+    assert abs(saved - 2 * sum(a.size for a in arrays.values())) < 100
+    loaded, _ = load_weights(half)
+    for name, array in arrays.items():
+        assert loaded[name].dtype == np.float32
+        np.testing.assert_array_equal(loaded[name], array.astype(np.float16).astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("value", "half", "words"),
+    [
+        (np.nan, False, "conv1.kernel is not finite.*the training diverged"),
+        (np.inf, True, "conv1.kernel is not finite.*the training diverged"),
+        (1e5, True, "expected values within float16; found 100000.*store float32"),
+    ],
+)
+def test_weights_that_are_not_finite_are_not_written(tmp_path, arrays, value, half, words):
+    arrays["conv1.kernel"] = np.full((1, 1, 32, 16), value, np.float32)
+    with pytest.raises(JaxsrError, match=words):
+        save_weights(tmp_path / "weights.safetensors", arrays, HEADER, half=half)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_header_must_be_json(tmp_path, arrays):
+    for value in (np.float32(1), float("nan"), {1, 2}):
+        with pytest.raises(JaxsrError, match="the header is no JSON"):
+            save_weights(tmp_path / "weights.safetensors", arrays, HEADER | {"value": value})
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("keep", [0, 4, 8, 100, -1])
+def test_a_truncated_file_is_named(tmp_path, arrays, keep):
+    path = tmp_path / "weights.safetensors"
+    save_weights(path, arrays, HEADER)
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(JaxsrError, match=r"weights.safetensors: .*expected a whole safetensors file"):
+        load_weights(path)
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda p: None, "no such file of weights"),
+        (lambda p: p.mkdir(), "a folder, not a file"),
+        (lambda p: p.write_bytes(b"PNG" * 100), "expected a whole safetensors file"),
+        (lambda p: save_file({"a": np.zeros(2, np.float32)}, p), "found no metadata; .*convert-weights"),
+        (lambda p: save_file({}, p, {"format": "pt"}), "which method its weights are for; .*found format"),
+        (lambda p: save_file({}, p, {"jaxsr": "{"}), "the header of the weights is damaged"),
+        (lambda p: save_file({}, p, {"jaxsr": "[1]"}), "which method"),
+        (lambda p: save_file({}, p, {"jaxsr": '{"scale": 4}'}), "which method"),
+    ],
+    ids=["missing", "folder", "other", "foreign", "no entry", "damaged", "list", "no method"],
+)
+def test_files_that_are_not_ours_are_named(tmp_path, write, words):
+    path = tmp_path / "weights.safetensors"
+    write(path)
+    with pytest.raises(JaxsrError, match=f"weights.safetensors: .*{words}"):
+        load_weights(path)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.pop("norm2.var"), r"expected its 12 arrays; found a file of 11 that lacks norm2.var;"),
+        (lambda a: a.update(x=np.zeros(1)), "found a file of 13 that has x;"),
+        (
+            lambda a: [a.pop(k) for k in list(a) if k.startswith("norm")] and a.update(x=np.zeros(1)),
+            "that lacks norm1.bias, .* and 5 more and has x;",
+        ),
+        (
+            lambda a: a.update({"conv1.kernel": a["conv1.kernel"][..., :5]}),
+            r"conv1.kernel has another shape .*expected \[1, 1, 32, 16\]; found \[1, 1, 32, 5\]",
+        ),
+    ],
+    ids=["missing", "extra", "both", "shape"],
+)
+def test_weights_of_another_network_are_named(state, arrays, change, words):
+    change(arrays)
+    with pytest.raises(JaxsrError, match=f"file.st: .*{words}"):
+        into(state, arrays, "file.st")
+
+
+# Published weights.
+
+
+def published(method, net, seed=0):
+    """Random weights for `net` under published names, in PyTorch's layouts."""
+    layers = {".".join(map(str, path)): module for path, module in nnx.iter_modules(net)}
+    leaves = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
+    rng, result = np.random.default_rng(seed), {}
+    for ours, theirs in PUBLISHED[method].layers(net):
+        for (leaf,), variable in nnx.to_flat_state(nnx.state(layers[ours])):
+            array = rng.random(variable.get_value().shape, np.float32)
+            if array.ndim == 4:
+                is_up = isinstance(layers[ours], nnx.ConvTranspose)
+                array = array.transpose(2, 3, 0, 1) if is_up else array.transpose(3, 2, 0, 1)
+            result[f"{theirs}.{leaves.get(leaf, leaf)}"] = np.ascontiguousarray(
+                array.T if array.ndim == 2 else array
+            )
+        if ".norm" in ours:
+            result[f"{theirs}.num_batches_tracked"] = np.array(7.0, np.float32)
+    return result
+
+
+@functools.cache
+def abstract(make, **arguments):
+    return nnx.eval_shape(lambda: make(**arguments, rngs=nnx.Rngs(0)))
+
+
+@pytest.mark.parametrize(
+    ("make", "arguments"),
+    [
+        (FusionSR, {}),
+        (FusionSR, {"fusion": "concat", "down_kernel": 2}),
+        (FusionSR, {"fusion": "add"}),
+        (FusionSR, {"buffers": ("normal", "depth")}),
+        (UNetSR, {}),
+        (UNetSR, {"buffers": ("base_color",), "down_kernel": 2}),
+    ],
+)
+def test_the_header_of_published_weights_builds_their_network(tmp_path, make, arguments):
+    source, out = tmp_path / "a.npz", tmp_path / "a.safetensors"
+    np.savez(source, **published("fusion-sr", abstract(make, **arguments)))
+    told = convert_published(source, out, buffers=arguments.get("buffers"), scale=2)
+    arrays, header = load_weights(out)
+    assert header["arguments"] == json.loads(json.dumps(told))
+    assert (header["method"], header["scale"], header["jaxsr"]) == ("fusion-sr", 2, jaxsr.__version__)
+    assert header["source"]["file"] == "a.npz"
+    assert {k: header["arguments"][k] for k in ("color", "start", "follow_jitter")} == {
+        "color": "display",
+        "start": "nothing",
+        "follow_jitter": False,
+    }
+    method = build(header["method"], header["arguments"])
+    net = nnx.eval_shape(lambda: method.new_net(nnx.Rngs(0)))
+    assert isinstance(net, make)
+    into(nnx.state(net), arrays, out)
+    for key, value in arguments.items():
+        assert method.arguments[key] == value
+
+
+@pytest.mark.parametrize("name", ["fusion_sr", "unet_sr"])
+def test_converted_weights_give_the_published_output(tmp_path, name):
+    if not (source := GOLDENS / f"{name}.npz").is_file():
+        pytest.skip("the goldens of the published networks are not here")
+    out = tmp_path / "converted.safetensors"
+    convert_published(source, out)
+    arrays, header = load_weights(out)
+    new_net = build(header["method"], header["arguments"]).new_net
+    graph, state = nnx.split(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))))
+    net = nnx.merge(graph, into(state, arrays, out))
+    net.eval()
+    graph, state = nnx.split(net)
+    golden = np.load(source)
+    inputs = (np.moveaxis(golden[f"in/{k}"], 1, -1) for k in ("color", "gbuffer"))
+    made = jax.jit(lambda state, *inputs: nnx.merge(graph, state)(*inputs))(state, *inputs)
+    expected = np.moveaxis(golden["out/y"], 1, -1)
+    np.testing.assert_allclose(made, expected, atol=1e-4 * np.abs(expected).max())
+
+
+# A .pth file by hand: a ZIP archive of a pickle, whose opcodes are written here, and of raw storages.
+
+
+def plain(value):
+    return pickle.dumps(value, 2)[2:-1]
+
+
+def tensor(key, size, stride, offset=0, storage="FloatStorage", length=1):
+    return (
+        b"ctorch._utils\n_rebuild_tensor_v2\n((" + plain("storage") + f"ctorch\n{storage}\n".encode()
+        + plain(key) + plain("cpu") + plain(length) + b"tQ" + plain(offset) + plain(size) + plain(stride)
+        + plain(False) + b"ccollections\nOrderedDict\n)RtR"
+    )  # fmt: skip
+
+
+def ordered(items):
+    return b"ccollections\nOrderedDict\n)R(" + b"".join(plain(k) + v for k, v in items.items()) + b"u"
+
+
+def state_dict(arrays):
+    return ordered(
+        {
+            name: tensor(str(i), a.shape, tuple(s // a.itemsize for s in a.strides), length=a.size)
+            for i, (name, a) in enumerate(arrays.items())
+        }
+    )
+
+
+def write_pth(path, body, storages, compression=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", compression) as file:
+        file.writestr("archive/data.pkl", b"\x80\x02" + body + b".")
+        file.writestr("archive/byteorder", b"little")
+        for key, content in storages.items():
+            file.writestr(f"archive/data/{key}", content)
+
+
+def dense(arrays):
+    return {str(i): a.tobytes() for i, a in enumerate(arrays.values())}
+
+
+@pytest.mark.parametrize("kind", [".pth", "wrapped.pth", ".npz", "sd.npz", ".safetensors", "parallel.pt"])
+def test_every_kind_of_file_is_read(tmp_path, capsys, kind):
+    arrays = published("fusion-sr", abstract(FusionSR))
+    source = tmp_path / f"weights{kind}"
+    if kind.endswith("npz"):
+        prefix = "sd/" if kind == "sd.npz" else ""
+        more = {"in/color": np.zeros(3)} if prefix else {}
+        np.savez(source, **{prefix + k: a for k, a in arrays.items()}, **more)
+    elif kind == ".safetensors":
+        save_file(arrays, source)
+    else:
+        named = {f"module.{k}" if kind == "parallel.pt" else k: a for k, a in arrays.items()}
+        body = state_dict(named)
+        if kind == "wrapped.pth":
+            body = b"}(" + plain("epoch") + plain(3) + plain("state_dict") + body + b"u"
+        write_pth(source, body, dense(named))
+    out = tmp_path / "out.safetensors"
+    status, told, _ = run(capsys, "convert-weights", source, out, "--method", "fusion-sr")
+    assert status == 0
+    assert "architecture fusion" in told
+    found, _ = load_weights(out)
+    convolution = arrays["fusion_reconstruct.rgb_conv2.conv.0.weight"]
+    np.testing.assert_array_equal(found["color_encoder.1.conv1.kernel"], convolution.transpose(2, 3, 1, 0))
+    np.testing.assert_array_equal(
+        found["fusions.0.norm2.var"], arrays["fusion_reconstruct.fuse1.residual.4.running_var"]
+    )
+
+
+def test_tensors_may_share_a_storage_and_be_of_other_types(tmp_path):
+    path, values = tmp_path / "a.pth", np.arange(12, dtype=np.float32)
+    items = {
+        "view": tensor("0", (2, 3), (1, 4), offset=1),
+        "whole": tensor("0", (12,), (1,)),
+        "scalar": tensor("0", (), (), offset=5),
+        "none": tensor("0", (0, 3), (3, 1)),
+        "count": tensor("1", (1,), (1,), storage="LongStorage"),
+        "brain": tensor("2", (2,), (1,), storage="BFloat16Storage"),
+    }
+    brain = np.array([0x3F80, 0xC000], np.uint16).tobytes()  # 1 and -2
+    write_pth(path, ordered(items), {"0": values.tobytes(), "1": np.array([7]).tobytes(), "2": brain})
+    found = read_published(path)
+    np.testing.assert_array_equal(found["view"], [[1, 5, 9], [2, 6, 10]])
+    np.testing.assert_array_equal(found["whole"], values)
+    assert found["scalar"] == 5
+    assert found["none"].shape == (0, 3)
+    np.testing.assert_array_equal(found["count"], [7])
+    np.testing.assert_array_equal(found["brain"], [1, -2])
+    assert all(a.dtype == np.float32 for a in found.values())
+
+
+def test_brain_floats_in_safetensors_are_read(tmp_path):
+    path = tmp_path / "a.safetensors"
+    head = json.dumps({"a": {"dtype": "BF16", "shape": [1], "data_offsets": [0, 2]}}).encode()
+    path.write_bytes(len(head).to_bytes(8, "little") + head + b"\x00\xc0")
+    np.testing.assert_array_equal(read_published(path)["a"], [-2])
+
+
+class Evil:
+    """Touches a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path
+
+    def __reduce__(self):
+        return Path.touch, (self.path,)
+
+
+def evil_pickle(tmp_path):
+    class Command:
+        def __reduce__(self):
+            return eval, (f"open({str(tmp_path / 'ran')!r}, 'w')",)
+
+    return pickle.dumps(Command(), 2)[2:-1]
+
+
+@pytest.mark.parametrize(
+    ("body", "named"),
+    [
+        (evil_pickle, "eval"),
+        (lambda p: ordered({"a": b"cos\nsystem\n(" + plain(f"touch {p}/ran") + b"tR"}), "os.system"),
+        (lambda p: ordered({"a": b"ctorch\nload\n(" + plain("x") + b"tR"}), "torch.load"),
+        (lambda p: b"cnumpy\nload\n(" + plain("x") + b"tR", "numpy.load"),
+        # With protocol 4 a name may have dots.
+        (lambda p: b"\x80\x04\x8c\x05torch\x8c\x16FloatStorage.__class__\x93.", "torch.FloatStorage.__class"),
+    ],
+    ids=["eval", "system", "torch", "numpy", "dots"],
+)
+def test_a_malicious_pickle_is_refused_in_one_line(tmp_path, capsys, body, named):
+    source, out = tmp_path / "evil.pth", tmp_path / "out.safetensors"
+    write_pth(source, body(tmp_path), {})
+    line = error_line(capsys, "convert-weights", source, out)
+    assert "evil.pth: the pickle names " in line
+    assert named in line
+    assert "could run code" in line
+    assert not (tmp_path / "ran").exists()
+    assert not out.exists()
+
+
+def test_a_pickle_cannot_change_the_reader(tmp_path):
+    path = tmp_path / "a.pth"
+    change = b"ctorch._utils\n_rebuild_tensor_v2\nN}(" + plain("size") + plain((9,)) + b"u\x86b0"
+    items = {"a": tensor("0", (2,), (1,))}
+    write_pth(path, change + ordered(items), {"0": np.ones(2, np.float32).tobytes()})
+    np.testing.assert_array_equal(read_published(path)["a"], [1, 1])
+
+
+def objects(path):
+    np.savez(path, a=np.array([Evil(path.parent / "ran")], object), allow_pickle=True)
+
+
+FOUR = {"0": np.ones(4, np.float32).tobytes()}
+
+
+@pytest.mark.parametrize(
+    ("name", "write", "words"),
+    [
+        ("a.pth", lambda p: p.write_bytes(pickle.dumps({"a": 1})), "expected a whole .pth file"),
+        ("a.pth", lambda p: write_pth(p, plain([1, 2]), {}), "no state dictionary in the file.*found list"),
+        ("a.pth", lambda p: write_pth(p, plain({"epoch": 1}), {}), "no state dictionary.*found epoch"),
+        ("a.pth", lambda p: write_pth(p, b"garbage", {}), "cannot read the weights"),
+        ("a.pth", lambda p: write_pth(p, ordered({"a": tensor("1", (2,), (1,))}), FOUR), "cannot read"),
+        (
+            "a.pth",
+            lambda p: write_pth(p, ordered({"a": tensor("0", (5,), (1,))}), FOUR),
+            "larger than its storage",
+        ),
+        (
+            "a.pth",
+            lambda p: write_pth(p, ordered({"a": tensor("0", (10**6, 10**6), (0, 0))}), FOUR),
+            "larger than its storage",
+        ),
+        (
+            "a.pth",
+            lambda p: write_pth(p, ordered({"a": tensor("0", (2,), (1,), offset=-1)}), FOUR),
+            "impossible layout",
+        ),
+        (
+            "a.pth",
+            lambda p: write_pth(p, ordered({"a": tensor("0", (2,), (1,))}), FOUR, zipfile.ZIP_DEFLATED),
+            "is compressed",
+        ),
+        ("a.npz", objects, "expected a whole .npz file of plain arrays"),
+        ("a.npz", lambda p: p.write_bytes(b"PK"), "expected a whole .npz file"),
+        ("a.safetensors", lambda p: p.write_bytes(b"x"), "expected a whole safetensors file"),
+        ("a.safetensors", lambda p: save_weights(p, {}, HEADER), "weights of jaxsr already"),
+        ("a.onnx", lambda p: p.write_bytes(b"x"), "unknown kind of weights; expected .pth, .pt, .npz"),
+        ("a.npz", lambda p: np.savez(p, a=np.zeros(2)), "not weights of a published fusion-sr network"),
+        ("a.npz", lambda p: np.savez(p), "no weights in the file"),
+        ("a.pth", lambda p: None, "no such file"),
+    ],
+)
+def test_damaged_published_files_are_named_in_one_line(tmp_path, capsys, name, write, words):
+    source, out = tmp_path / name, tmp_path / "out.safetensors"
+    write(source)
+    line = error_line(capsys, "convert-weights", source, out)
+    with pytest.raises(JaxsrError, match=f"{name}: .*{words}"):
+        raise JaxsrError(line.removeprefix("jaxsr: "))
+    assert not out.exists()
+    assert not (tmp_path / "ran").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "options", "words"),
+    [
+        (lambda a: a.pop("cur_rgb_extract.f_e_net.0.bias"), (), "rgb_extract.f_e_net.0.bias is missing"),
+        (lambda a: a.update(more=np.zeros(1)), (), "does not have; .*found 1 more: more"),
+        (
+            lambda a: a.update({"cur_rgb_extract.f_e_net.0.bias": np.zeros(5)}),
+            (),
+            r"color_shallow.conv1.bias has another shape .*expected \[32\]; found \[5\]",
+        ),
+        (lambda a: None, ("--buffers", "depth"), "expected 9; found 1"),
+        (lambda a: None, ("--buffers", "colour"), "bad parts of the G-buffer"),
+        (lambda a: None, ("--method", "taau"), "no published weights of 'taau'.*expected one of fusion-sr"),
+    ],
+)
+def test_published_weights_that_do_not_fit_are_named(tmp_path, capsys, change, options, words):
+    arrays = published("fusion-sr", abstract(FusionSR))
+    change(arrays)
+    source, out = tmp_path / "a.npz", tmp_path / "out.safetensors"
+    np.savez(source, **arrays)
+    line = error_line(capsys, "convert-weights", source, out, *options)
+    with pytest.raises(JaxsrError, match=words):
+        raise JaxsrError(line)
+    assert not out.exists()
+
+
+def test_the_buffers_of_a_smaller_network_must_be_said(tmp_path, capsys):
+    source = tmp_path / "a.npz"
+    np.savez(source, **published("fusion-sr", abstract(FusionSR, buffers=("depth", "normal"))))
+    line = error_line(capsys, "convert-weights", source, tmp_path / "out.safetensors")
+    assert "G-buffer of 4 channels" in line
+    assert "--buffers" in line
+    line = error_line(capsys, "convert-weights", source, tmp_path / "out.pth")
+    assert "end in .safetensors" in line
+    out = tmp_path / "out.safetensors"
+    status, told, _ = run(capsys, "convert-weights", source, out, "--buffers", "depth", "normal", "--half")
+    assert status == 0
+    assert load_weights(out)[1]["arguments"]["buffers"] == ["depth", "normal"]
+    assert "normal" in told
