@@ -28,10 +28,10 @@ from benchmarks import _common
 from benchmarks._common import Inputs, Prepared, Variant
 from jaxsr import perceptual
 from jaxsr.frames import Camera, Frame, GBuffer, Window
-from jaxsr.io.published import translate
 from jaxsr.io.weights import into
 from jaxsr.methods import Method, fusion_sr
 from jaxsr.nets import FusionSR
+from jaxsr.nets.published import translate
 from jaxsr.training import TrainConfig
 from jaxsr.training.state import begin
 from jaxsr.training.step import make_step, shardings

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 import jax
@@ -89,7 +90,7 @@ def main() -> None:
 
         def watch() -> None:
             while not list((Path(out) / "checkpoints").glob(f"{number}.*tmp*/**/manifest*")):
-                pass
+                time.sleep(1e-4)  # or it keeps the others from running
             kill()
 
         threading.Thread(target=watch, daemon=True).start()

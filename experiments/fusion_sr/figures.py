@@ -93,7 +93,8 @@ def crops(shown: Sequence[Shown]) -> list[tuple[int, int, int, int]]:
     for _ in COLORS:
         y, x = (int(v) for v in np.unravel_index(np.argmax(sums), sums.shape))
         found.append((x, y, x + width, y + height))
-        sums[max(y - height + 1, 0) : y + height, max(x - width + 1, 0) : x + width] = -1
+        # A crop's breadth between them: the same thing twice tells nothing.
+        sums[max(y - 2 * height + 1, 0) : y + 2 * height, max(x - 2 * width + 1, 0) : x + 2 * width] = -1
     return found
 
 

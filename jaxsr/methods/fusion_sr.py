@@ -28,7 +28,7 @@ where base colour and normal are there, else by a plain backward warp.
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Literal
+from typing import Literal, get_args, get_origin, get_type_hints
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +41,7 @@ from jaxsr.losses import lpips, ssim_loss
 from jaxsr.methods import guided, guided_taau, taau
 from jaxsr.methods._method import Loss, Method, Net, by_rendered
 from jaxsr.nets import FusionSR, UNetSR
+from jaxsr.nets.layers import count_channels
 from jaxsr.ops import backward_warp, demodulate, from_display, modulate, to_display
 
 BUFFERS = ("depth", "base_color", "normal", "roughness", "metallic")
@@ -181,15 +182,26 @@ def middle(image: Float[Array, "b H W c"], size: int) -> Float[Array, "b h w c"]
     return image[:, y : y + size, x : x + size]
 
 
+def _check(options: Options) -> None:
+    """Files of weights and command lines bring any value: a wrong one must not count as the other one."""
+    if unknown := [name for name in options.buffers if name not in BUFFERS]:
+        raise JaxsrError(f"unknown buffer {unknown[0]!r}", where="buffers", expected=", ".join(BUFFERS))
+    count_channels(options.buffers)
+    for name, kind in get_type_hints(Options).items():
+        value = getattr(options, name)
+        if get_origin(kind) is Literal and value not in get_args(kind):
+            expected = " | ".join(map(str, get_args(kind)))
+            raise JaxsrError(f"unknown {name}", where=name, expected=expected, found=value)
+
+
 def method(options: Options | None = None) -> Method:
     """The network of these options as a method.
 
     Raises:
-        JaxsrError: an unknown buffer.
+        JaxsrError: an option that has no such value.
     """
     o = options or Options()
-    if unknown := [name for name in o.buffers if name not in BUFFERS]:
-        raise JaxsrError(f"unknown buffer {unknown[0]!r}", where="buffers", expected=", ".join(BUFFERS))
+    _check(o)
     is_guided = {"base_color", "normal"} <= set(o.buffers)
 
     def new_net(rngs: nnx.Rngs) -> nnx.Module:

@@ -1,0 +1,146 @@
+"""Put trained networks into the package, with a model card each.
+
+    python experiments/fusion_sr/release.py [NAME ...] [--runs DIR]
+
+For each run of `train_released.py` that has ended: store its weights as float16 in
+`jaxsr/weights/NAME.safetensors`, measure that file and its rivals on the test frames of the sample, and write
+`docs/models/NAME.md` with data, budget, metrics and limits, and `experiments/results/NAME.json` with every
+number of every frame.
+"""
+
+import json
+import math
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import tyro  # noqa: E402
+from tyro.conf import Positional  # noqa: E402
+
+from experiments.fusion_sr.train_released import RUNS, Run  # noqa: E402
+from experiments.provenance import commit  # noqa: E402
+from jaxsr.errors import JaxsrError  # noqa: E402
+from jaxsr.evaluation.demo import description  # noqa: E402
+from jaxsr.evaluation.evaluate import evaluate  # noqa: E402
+from jaxsr.evaluation.progress import bars  # noqa: E402
+from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
+from jaxsr.evaluation.sections import Section  # noqa: E402
+from jaxsr.evaluation.tables import as_json, cell, header, summary  # noqa: E402
+from jaxsr.evaluation.upscale import Settings  # noqa: E402
+from jaxsr.io.exr import atomic_path  # noqa: E402
+from jaxsr.io.weights import load_weights, save_weights  # noqa: E402
+
+RIVALS = ("bicubic", "taau", "guided-taau")
+MAX_MEGABYTES = 2.0
+WEIGHTS, CARDS = ROOT / "jaxsr" / "weights", ROOT / "docs" / "models"
+RESULTS = ROOT / "experiments" / "results"
+
+
+def main(
+    names: Positional[tuple[str, ...]] = (),
+    runs: Path = ROOT / "experiments" / "cache" / "runs",
+) -> None:
+    """Release these runs; all that have ended by default.
+
+    Args:
+        names: of the runs.
+        runs: folder of the runs.
+    """
+    if unknown := [name for name in names if name not in RUNS]:
+        raise JaxsrError(f"no run {unknown[0]!r}", expected=", ".join(RUNS))
+    for name, run in RUNS.items():
+        if names and name not in names:
+            continue
+        file = runs / name / "weights.safetensors"
+        if not names and not file.is_file():
+            continue
+        arrays, head = load_weights(file)
+        if head["training"]["steps"] != run.config.steps:
+            raise JaxsrError(
+                "the run has not ended",
+                where=file,
+                expected=f"{run.config.steps} steps",
+                found=head["training"]["steps"],
+                fix="run train_released.py again: it goes on",
+            )
+        target = WEIGHTS / f"{name}.safetensors"
+        save_weights(target, arrays, head, half=True)
+        if (size := target.stat().st_size / 1e6) > MAX_MEGABYTES:
+            raise JaxsrError(
+                "too large", where=target, expected=f"{MAX_MEGABYTES} MB", found=f"{size:.1f} MB"
+            )
+        release(name, run, target, head)
+
+
+def release(name: str, run: Run, weights: Path, head: dict[str, Any]) -> None:
+    """Measure the file as it ships, and write the card and the numbers."""
+    with tempfile.TemporaryDirectory() as folder, bars() as progress:
+        sample = unpack_sample(Path(folder) / "sample", "test", run.scenes, run.config.scale, progress)
+        sections = evaluate(
+            sample,
+            [*RIVALS, str(weights)],
+            Path(folder) / "out",
+            Settings(scale=run.config.scale),
+            title=name,
+            progress=progress,
+        )
+    meta = description(commit=commit(), weights=weights.name)
+    results = as_json(sections, title=name, meta=meta)
+    write(RESULTS / f"{name}.json", json.dumps(results, indent=1) + "\n")
+    write(CARDS / f"{name}.md", card(name, run, head, sections, weights))
+    print(f"{weights.name}: {weights.stat().st_size / 1e6:.2f} MB")
+
+
+def table(sections: list[Section]) -> list[str]:
+    """Means over the frames of each scene."""
+    keys = sections[0].metric_keys()
+    lines = [
+        "| test clip | method | " + " | ".join(map(header, keys)) + " |",
+        "|---|---|" + "---:|" * len(keys),
+    ]
+    for section in sections:
+        everything = section.subsets()["all"]
+        for track in section.tracks:
+            cells = [cell(summary(track, key, everything), key) for key in keys]
+            lines.append(f"| {section.title.split(',')[0]} | `{track.name}` | " + " | ".join(cells) + " |")
+    return lines
+
+
+def card(name: str, run: Run, head: dict[str, Any], sections: list[Section], weights: Path) -> str:
+    """The model card as Markdown."""
+    count = sum(math.prod(array.shape) for array in load_weights(weights)[0].values())
+    training, arguments = head["training"], head["arguments"]
+    values = {**arguments, **training["config"], **training["made"]}
+    values |= {
+        "name": name,
+        "count": f"{count:,}",
+        "megabytes": f"{weights.stat().st_size / 1e6:.2f}",
+        "buffers": ", ".join(arguments["buffers"]),
+        "clips": len(training["sequences"]),
+        "scenes": ", ".join(run.scenes),
+        "hours": f"{training['seconds'] / 3600:.2f}",
+        "origin": f"; starts from the weights of [`{run.start}`]({run.start}.md)" if run.start else "",
+        "track": sections[0].tracks[-1].name,
+        "table": "\n".join(table(sections)),
+        "measured": time.strftime("%Y-%m-%d"),
+        "day": training["made"]["date"][:10],
+    }
+    return (Path(__file__).parent / "model_card.md").read_text(encoding="utf-8").format(**values)
+
+
+def write(path: Path, text: str) -> None:
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main, config=(tyro.conf.OmitArgPrefixes,))
+    except JaxsrError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
