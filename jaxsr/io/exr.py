@@ -175,6 +175,8 @@ class _Muted:
 
     lock = threading.Lock()
     readers: set[int] = set()  # noqa: RUF012
+    last: "_Muted | None" = None
+    """Kept and used again: `print` holds no reference to sys.stdout, so one that is freed here crashes it."""
 
     def __init__(self, stream: Any):
         self.stream = stream
@@ -195,7 +197,9 @@ def _muted() -> Iterator[None]:
     with _Muted.lock:
         _Muted.readers.add(threading.get_ident())
         if sys.stdout is not None and not isinstance(sys.stdout, _Muted):
-            sys.stdout = _Muted(sys.stdout)
+            if _Muted.last is None or _Muted.last.stream is not sys.stdout:
+                _Muted.last = _Muted(sys.stdout)
+            sys.stdout = _Muted.last
     try:
         yield
     finally:
