@@ -155,7 +155,7 @@ def test_features_kept_give_the_same(net):
 )
 def test_gradients_are_finite_and_reach_the_prediction_alone(net, pred, target):
     noise, _ = images(3)
-    pred, target = (noise if v == "noise" else jnp.full(noise.shape, v) for v in (pred, target))
+    pred, target = (noise if v == "noise" else jnp.full(noise.shape, v, noise.dtype) for v in (pred, target))
     value, (first, *others) = compiled(net)(pred, target, small_params(net, 3))
     assert np.isfinite(value)
     assert np.isfinite(first).all()
@@ -248,7 +248,7 @@ def small_file(**changes):
         (lambda p: pickle.dumps(small_file()), "another network"),
         (lambda p: pickle.dumps({"VGG16_0": {}}), "KeyError: 'Conv_0'"),
         (lambda p: pickle.dumps([1]), "TypeError"),
-        (lambda p: pickle.dumps(small_file())[:200], "cannot read the weights"),
+        (lambda p: pickle.dumps(small_file())[:200], "UnpicklingError"),
         (lambda p: b"", "EOFError"),
         (lambda p: b"PK garbage", "UnpicklingError"),
         (None, "FileNotFoundError"),

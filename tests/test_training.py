@@ -118,7 +118,7 @@ def test_interrupt_saves_and_goes_on(whole, data, tmp_path, monkeypatch, capfd):
             os.kill(os.getpid(), signal.SIGINT)
         update(self, step, loss)
 
-    out = tmp_path / "out"
+    out, before = tmp_path / "out", signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(Bar, "update", interrupting)
     with pytest.raises(KeyboardInterrupt):
         tiny_method.train(data, out)
@@ -126,7 +126,7 @@ def test_interrupt_saves_and_goes_on(whole, data, tmp_path, monkeypatch, capfd):
     assert "once more stops at once" in capfd.readouterr().err
     stopped = max(int(p.name) for p in (out / "checkpoints").iterdir())
     assert stopped in (5, 6, 7)
-    assert signal.getsignal(signal.SIGINT) == signal.default_int_handler
+    assert signal.getsignal(signal.SIGINT) == before
     tiny_method.train(data, out)
     assert digest(out) == digest(whole)
 
@@ -254,16 +254,16 @@ def test_weights_of_other_options_are_noted(data, tmp_path, capsys):
     )
 
 
-def test_the_sample_is_the_default(data, tmp_path):
+def test_the_sample_is_the_default(tmp_path):
     """Its training frames are unpacked into the cache, once."""
     out, cache = tmp_path / "out", tmp_path / "cache"
-    options = {"data": (), "cache": cache, "scale": 4, "crop": 16, "steps": 1, "eval_every": 5}
-    tiny_method.train(data, out, **options)
+    config = TrainConfig(out=out, cache=cache, crop=16, batch=2, steps=1)
+    train_method(tiny_method.method(), config, quiet=True)
     names = [text.split()[0] for text in json.loads((out / "config.json").read_text())["sequences"]]
     assert names == ["bunker-train-0", "docks-train-0", "forest-train-0"]
     (sample,) = cache.glob("sample-*")
     first = next(sample.glob("*/hr/*.exr")).stat().st_mtime_ns
-    tiny_method.train(data, out, **options)
+    train_method(tiny_method.method(), config, quiet=True)
     assert next(sample.glob("*/hr/*.exr")).stat().st_mtime_ns == first
 
 

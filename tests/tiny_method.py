@@ -58,8 +58,7 @@ def train(data: Path, out: Path, **options):
     from jaxsr.training import train as train_method
 
     shorter = {"steps": 12, "batch": 2, "crop": 32, "scale": 2, "eval_every": 4, "save_every": 3, "ema": 0.9}
-    where = {"data": (data,), "out": out, "cache": data.parent / "cache"}
-    config = TrainConfig(**where | shorter | options)
+    config = TrainConfig(data=(data,), out=out, cache=data.parent / "cache", **shorter | options)
     return train_method(method(), config, quiet=True)
 
 
