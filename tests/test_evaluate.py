@@ -12,7 +12,7 @@ from jaxsr import metrics
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation import evaluate as evaluation
 from jaxsr.evaluation import upscale
-from jaxsr.evaluation.evaluate import evaluate, find_methods, find_sequences
+from jaxsr.evaluation.evaluate import evaluate, find_methods
 from jaxsr.evaluation.regions import REGIONS, regions
 from jaxsr.evaluation.run import find_method, shipped_scales
 from jaxsr.evaluation.tables import rich_tables
@@ -242,19 +242,6 @@ def test_lpips_is_one_of_the_metrics(data, tmp_path):
     assert section.metric_keys() == list(metrics.METRICS)
     assert section.tracks[0].metrics["lpips"][0] > 0
     assert section.tracks[0].regions["edges"]["lpips"][0] > 0
-
-
-def test_sequences_are_found_in_folders(data, tmp_path):
-    one, two = data / "set" / "one", data / "set" / "two"
-    assert find_sequences([data / "set"]) == [one, two]
-    assert find_sequences([data, two / "sequence.json"]) == [one, two, two]
-    for words, places in {
-        "no such folder": [tmp_path / "none"],
-        "no sequence in the folder": [tmp_path],
-        "no sequences to evaluate": [],
-    }.items():
-        with pytest.raises(JaxsrError, match=words):
-            find_sequences(places)
 
 
 def test_methods_are_found(data, tmp_path, monkeypatch):

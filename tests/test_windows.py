@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxsr.data.windows import NEEDS, WindowSource, find_sequences, stack
+from jaxsr.data.windows import NEEDS, WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import GBuffer
 from tests.builders import make_sequence
@@ -106,21 +106,6 @@ def test_nothing_is_read_before_the_batch(tmp_path):
         while isinstance(base.base, np.ndarray):
             base = base.base
         assert isinstance(base, np.memmap)
-
-
-def test_sequences_are_found(tmp_path):
-    for name in ("set/b", "set/a", "other"):
-        make_sequence(tmp_path / name, **SMALL, frames=1)
-    (tmp_path / "set/logs").mkdir()
-    a, b, other = tmp_path / "set/a", tmp_path / "set/b", tmp_path / "other"
-    assert find_sequences([tmp_path / "set"]) == [a, b]
-    assert find_sequences([other, str(tmp_path / "set")]) == [other, a, b]
-    assert find_sequences([b / "sequence.json", tmp_path / "set", a]) == [b, a]
-    for bad, message in (([tmp_path / "nowhere"], "nowhere: no such folder"), ([], "no sequences")):
-        with pytest.raises(JaxsrError, match=message):
-            find_sequences(bad)
-    with pytest.raises(JaxsrError, match=r"logs: no sequence; expected a folder with sequence.json"):
-        find_sequences([a, tmp_path / "set/logs"])
 
 
 def test_errors_name_the_sequence(tmp_path):

@@ -17,9 +17,10 @@ import grain
 
 from jaxsr.data.augment import random_crop
 from jaxsr.data.cache import Progress, source_key
-from jaxsr.data.windows import WindowSource, find_sequences, stack
+from jaxsr.data.windows import WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
+from jaxsr.io.find import find_sequences
 
 _THREADS, _AHEAD = 2, 4
 

@@ -149,34 +149,6 @@ def stack(windows: Sequence[Window]) -> Window:
     return jax.tree.map(leaf, *windows)
 
 
-def find_sequences(paths: Iterable[str | Path]) -> list[Path]:
-    """Folders of sequences, each once, in the order given.
-
-    Args:
-        paths: sequences, or folders that hold sequences, which are then taken in the order of their names.
-
-    Raises:
-        JaxsrError: a path that is neither; none at all.
-    """
-    found: list[Path] = []
-    for path in (Path(p) for p in paths):
-        path = path.parent if path.name == "sequence.json" else path
-        inside = [path] if (path / "sequence.json").is_file() else []
-        if not inside and path.is_dir():
-            inside = sorted(p.parent for p in path.glob("*/sequence.json"))
-        if not inside:
-            raise JaxsrError(
-                "no sequence" if path.is_dir() else "no such folder",
-                where=path,
-                expected="a folder with sequence.json, or one that holds such folders",
-                fix="docs/data.md says how to make one",
-            )
-        found += inside
-    if not found:
-        raise JaxsrError("no sequences", fix="name at least one folder of a sequence")
-    return list({p.resolve(): p for p in reversed(found)}.values())[::-1]
-
-
 def _starts(clip: Clip, length: int, held_back: int) -> list[int]:
     frames = max(len(clip) - held_back, 0)
     cuts = [k for k, info in enumerate(clip.infos[:frames]) if info.cut and k] + [frames]

@@ -19,37 +19,8 @@ from jaxsr.evaluation.run import Ready, check_needs, find_method
 from jaxsr.evaluation.sections import Section
 from jaxsr.evaluation.tables import write_metrics
 from jaxsr.evaluation.upscale import Settings, run_section
+from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence as FrameSequence
-
-DEPTH = 3
-"""How far below a folder sequences are looked for."""
-
-
-def find_sequences(places: Sequence[Path]) -> list[Path]:
-    """The sequences at these places: each is one, or a folder that has some in it.
-
-    Raises:
-        JaxsrError: no such folder, or no sequence in it.
-    """
-    found: list[Path] = []
-    for place in places:
-        if not place.is_dir() and place.name != "sequence.json":
-            raise JaxsrError("no such folder", where=place, expected="a sequence, or a folder of sequences")
-        place = place.parent if place.name == "sequence.json" else place
-        here = next(
-            (at for n in range(DEPTH + 1) if (at := sorted(place.glob("*/" * n + "sequence.json")))), None
-        )
-        if here is None:
-            raise JaxsrError(
-                "no sequence in the folder",
-                where=place,
-                expected="a file sequence.json in it, or in folders in it",
-                fix="docs/data.md says how to make one",
-            )
-        found += [file.parent for file in here]
-    if not found:
-        raise JaxsrError("no sequences to evaluate", fix="name at least one folder")
-    return found
 
 
 def find_methods(names: Sequence[str], scale: int) -> list[Ready]:

@@ -25,11 +25,11 @@ import jaxsr
 from jaxsr import perceptual
 from jaxsr.data.cache import default_cache
 from jaxsr.data.loader import Loader, make_loader
-from jaxsr.data.windows import find_sequences
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.progress import bars
 from jaxsr.evaluation.sample import sample_folder, unpack_sample
 from jaxsr.frames import Window
+from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence, prefetch
 from jaxsr.io.weights import into, load_weights, save_weights
 from jaxsr.methods import Method
