@@ -209,6 +209,18 @@ def test_dark_surfaces_have_no_specks(name):
         assert made.image.max() < 2 * brightest
 
 
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("unit", [1e-3, 1e4])
+def test_the_unit_of_radiance_does_not_matter(name, unit):
+    frames, _ = clip(2, 4, 2)
+    others = [
+        f._replace(color_linear=f.color_linear * np.float32(unit), exposure=f.exposure / np.float32(unit))
+        for f in frames
+    ]
+    for made, expected in zip(stream(METHODS[name], others), outputs(name, 2, 4, 2), strict=True):
+        np.testing.assert_allclose(made.image / unit, expected, rtol=1e-3, atol=1e-4)
+
+
 def test_taau_forgets_light_that_went_out():
     """The clipping box: a history that the frame contradicts is dropped at once, not averaged away."""
     frames, truths = clip(2, 8, still=True)

@@ -122,7 +122,7 @@ def color_input(frame: Frame, options: Options) -> Float[Array, "*b h w 3"]:
 def starting_point(frame: Frame, options: Options) -> Float[Array, "H W 3"]:
     """E of one frame, as the network sees colour: the lighting of the alike samples around each HR pixel."""
     made = guided_taau.estimate(frame, guided_taau.Options())
-    lighting = taau.from_working(made.color)
+    lighting = taau.from_working(made.color, frame.exposure)
     if options.color == "lighting":
         return compress_lighting(lighting * frame.exposure)
     return to_display(modulate(lighting, guided.surface(frame.hr)[0]), frame.exposure)

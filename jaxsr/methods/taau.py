@@ -14,7 +14,8 @@ Jittered LR frames are accumulated into an HR history. Symbols:
     out     = (n' h' + beta c) / (n' + beta),   n <- min(n' + beta, memory)
 
 Equations are those of `jaxsr.ops.jitter`; motion says where to look, depth whether to trust what is there.
-The average is taken of tone-mapped colour (Reinhard), so that one bright sample does not flicker. A frame
+The average is taken of exposed, tone-mapped colour (Reinhard), so that one bright sample does not flicker,
+and the unit of radiance does not matter. A frame
 that was not rendered is the history warped backward, unclipped: the plain warp that guided reprojection must
 beat.
 """
@@ -71,14 +72,14 @@ def init(frame: Frame) -> State:
     return State(jnp.zeros((*depth.shape[:-1], 3), depth.dtype), jnp.zeros_like(depth), jnp.zeros_like(depth))
 
 
-def to_working(color_linear: Float[Array, "H W 3"]) -> Float[Array, "H W 3"]:
-    """Where colours are averaged and clipped: YCoCg of tone-mapped colour."""
-    return ycocg_from_rgb(tone_map(color_linear, "reinhard"))
+def to_working(color_linear: Float[Array, "H W 3"], exposure: Float[Array, ""]) -> Float[Array, "H W 3"]:
+    """Where colours are averaged and clipped: YCoCg of exposed and tone-mapped colour."""
+    return ycocg_from_rgb(tone_map(color_linear * exposure, "reinhard"))
 
 
-def from_working(color: Float[Array, "H W 3"]) -> Float[Array, "H W 3"]:
-    """The inverse of `to_working`, not negative."""
-    return inverse_tone_map(jnp.clip(rgb_from_ycocg(color), 0, 0.9999), "reinhard")
+def from_working(color: Float[Array, "H W 3"], exposure: Float[Array, ""]) -> Float[Array, "H W 3"]:
+    """The inverse of `to_working`, not negative; exposed, at most 9999."""
+    return inverse_tone_map(jnp.clip(rgb_from_ycocg(color), 0, 0.9999), "reinhard") / exposure
 
 
 class Estimate(NamedTuple):
@@ -255,10 +256,12 @@ def method(options: Options | None = None) -> Method:
         if frame.scale == 1:  # every pixel was sampled: nothing to accumulate
             image = frame.color_linear
             return State(image, jnp.full_like(depth, o.memory), depth), image
-        now = estimate(to_working(frame.color_linear), frame.jitter_px, frame.scale, o, _all_alike)
-        before, weight = fetch_history(to_working(state.image), state.weight, state.depth_linear, frame, o)
+        color = to_working(frame.color_linear, frame.exposure)
+        now = estimate(color, frame.jitter_px, frame.scale, o, _all_alike)
+        history = to_working(state.image, frame.exposure)
+        before, weight = fetch_history(history, state.weight, state.depth_linear, frame, o)
         blended, weight = accumulate(before, weight, now, o)
-        image = from_working(blended)
+        image = from_working(blended, frame.exposure)
         return State(image, weight, depth), image
 
     def extrapolate(net: None, state: State, frame: Frame) -> tuple[State, Array]:
