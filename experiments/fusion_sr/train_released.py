@@ -18,7 +18,7 @@ sys.path.insert(0, str(ROOT))
 import tyro  # noqa: E402
 from tyro.conf import Positional  # noqa: E402
 
-from experiments.make_datasets import CACHE  # noqa: E402
+from experiments.make_datasets import CACHE, Render, clips_of  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.methods import fusion_sr  # noqa: E402
 from jaxsr.training.config import TrainConfig  # noqa: E402
@@ -56,6 +56,24 @@ RUNS = {
 }
 
 
+def folders_of(scenes: tuple[str, ...], data: Path) -> tuple[Path, ...]:
+    """The training clips of these scenes.
+
+    Raises:
+        JaxsrError: one is missing.
+    """
+    folders = [data / clip.name for clip in sorted(clips_of(Render("train", scenes)), key=lambda c: c.name)]
+    for folder in folders:
+        if not (folder / "sequence.json").is_file():
+            raise JaxsrError(
+                "no training clip",
+                where=folder,
+                expected=f"{len(folders)} clips of {', '.join(scenes)} in {data}",
+                fix="python experiments/make_datasets.py render --set train, or --data",
+            )
+    return tuple(folders)
+
+
 def main(
     names: Positional[tuple[str, ...]] = (),
     data: Path = CACHE / "train",
@@ -73,9 +91,8 @@ def main(
     for name, run in RUNS.items():
         if names and name not in names:
             continue
-        clips = tuple(sorted(path for scene in run.scenes for path in data.glob(f"{scene}-train-*")))
         start = None if run.start is None else runs / run.start / "weights.safetensors"
-        config = replace(run.config, data=clips, out=runs / name, init=start)
+        config = replace(run.config, data=folders_of(run.scenes, data), out=runs / name, init=start)
         print(f"{name}: {train(fusion_sr.method(OPTIONS), config)}")
 
 
