@@ -9,6 +9,7 @@ division has a constant in it that keeps it from zero.
 """
 
 import functools
+import math
 
 import jax
 import jax.numpy as jnp
@@ -131,7 +132,7 @@ def hard_l1(
         raise JaxsrError("bad fraction", where="hard_l1", expected="in (0, 1]", found=fraction)
     height, width, channels = pred.shape[-3:]
     error = jnp.abs(pred - target).reshape(-1, height * width, channels)
-    count = max(int(fraction * height * width), 1)
+    count = max(math.floor(fraction * height * width + 1e-6), 1)  # 0.29 * 100 is 28.999...
     return jnp.mean(jax.lax.top_k(error.swapaxes(1, 2), count)[0])
 
 

@@ -1,6 +1,5 @@
 """Training: the same to the bit however often it is killed, on two devices as on one, and clear errors."""
 
-import contextlib
 import dataclasses
 import json
 import os
@@ -317,9 +316,27 @@ class TestErrors:
 
     def test_what_may_change(self, whole, data, tmp_path):
         """Intervals, and where the data lie."""
-        moved = tmp_path / "elsewhere"
+        moved, out = tmp_path / "elsewhere", copied(whole, tmp_path)
         shutil.copytree(data, moved)
-        tiny_method.train(moved, copied(whole, tmp_path), eval_every=5, save_every=7)
+        shutil.rmtree(out / "checkpoints" / "12")  # as if it had been killed before the last one
+        tiny_method.train(moved, out, eval_every=5, save_every=7)
+        assert digest(out) == digest(whole)
+
+    def test_weights_that_it_began_with(self, whole, data, tmp_path):
+        """Their numbers count, until there is a checkpoint; then the file may go."""
+        file, out = tmp_path / "first.safetensors", tmp_path / "out"
+        shutil.copy(whole / "weights.safetensors", file)
+        tiny_method.train(data, out, steps=2, init=file)
+        moved = file.rename(tmp_path / "moved.safetensors")
+        tiny_method.train(data, out, steps=2, init=moved)
+        tiny_method.train(data, out, steps=2, init=file)
+        with pytest.raises(JaxsrError, match=r"init: \w{12} -> null"):
+            tiny_method.train(data, out, steps=2)
+        shutil.copy(out / "weights.safetensors", file)
+        with pytest.raises(JaxsrError, match=r"init: \w{12} -> \w{12}"):
+            tiny_method.train(data, out, steps=2, init=file)
+        with pytest.raises(JaxsrError, match=r"none.safetensors: no such file"):
+            tiny_method.train(data, tmp_path / "new", steps=2, init=tmp_path / "none.safetensors")
 
     def test_other_data(self, whole, tmp_path):
         make_sequence(tmp_path / "data" / "other", frames=4)
@@ -434,6 +451,9 @@ class TestErrors:
     def test_trained_on_what_is_evaluated(self, data, tmp_path):
         with pytest.raises(JaxsrError, match="clip: is in --data and in --eval-data"):
             tiny_method.train(data, tmp_path / "out", eval_data=(data / "clip",))
+        copy = shutil.copytree(data / "clip", tmp_path / "copy" / "clip")
+        with pytest.raises(JaxsrError, match="clip: is in --data and in --eval-data"):
+            tiny_method.train(data, tmp_path / "out", eval_data=(copy,))
 
     def test_too_short(self, tmp_path):
         make_sequence(tmp_path / "clip", frames=1)
@@ -519,8 +539,10 @@ def test_help(capsys):
     status, out, _ = run(capsys, "train", "--help")
     assert status == 0
     assert "fusion-sr" in out
-    with contextlib.suppress(SystemExit):
-        run(capsys, "train", "fusion-sr", "--help")
+    status, out, _ = run(capsys, "train", "fusion-sr", "--help")
+    assert status == 0
+    assert "--learning-rate" in out
+    assert "--fusion" in out
 
 
 @pytest.mark.slow

@@ -5,6 +5,7 @@ is long. A record without results, as an interrupted run leaves it, or with anot
 """
 
 import hashlib
+import importlib.metadata
 import importlib.resources
 import json
 import math
@@ -28,8 +29,9 @@ from jaxsr.metrics import available
 
 RECORD = "result.json"
 FOLDERS = ("exr", "png", "flip")
-CODE = ("frames.py", "metrics.py", "perceptual.py", "evaluation/regions.py", "methods", "nets", "ops")
-"""What of the package results depend on: who edits a method wants new ones."""
+NOT_CODE = ("cli.py", "training", "data", "evaluation/report.py", "evaluation/tables.py")
+"""Of the package, what results do not depend on; who edits a method wants new ones."""
+PACKAGES = ("jax", "numpy", "dm-pix", "flip-evaluator")
 
 
 def run_kept(
@@ -67,11 +69,12 @@ def _key(sequence: FrameSequence, ready: Ready, settings: Settings, reference: R
     files = [file for name in sequence.resolutions for file in sorted((sequence.path / name).iterdir())]
     stats = [(file.parent.name, file.name, file.stat()) for file in files]
     listing = [f"{folder}/{name} {stat.st_size} {stat.st_mtime_ns}" for folder, name, stat in stats]
-    package = importlib.resources.files(jaxsr)
-    code = [p for name in CODE for p in _sources(Path(str(package / name)))]
+    package = Path(str(importlib.resources.files(jaxsr)))
+    names = ((file.relative_to(package).as_posix(), file) for file in sorted(package.rglob("*.py")))
+    code = [file for name, file in names if not name.startswith(NOT_CODE)]
     return {
         "jaxsr": jaxsr.__version__,
-        "jax": jax.__version__,
+        "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
         "device": jax.devices()[0].device_kind,
         "code": _digest(file.read_bytes() for file in code),
         "method": ready.method.name,
@@ -81,10 +84,6 @@ def _key(sequence: FrameSequence, ready: Ready, settings: Settings, reference: R
         "settings": settings._replace(metrics=settings.metrics or available())._asdict(),
         "regions": reference.in_regions,
     }
-
-
-def _sources(place: Path) -> list[Path]:
-    return [place] if place.suffix == ".py" else sorted(place.glob("*.py"))
 
 
 def _digest(parts: Iterable[bytes]) -> str:

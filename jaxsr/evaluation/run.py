@@ -65,6 +65,11 @@ def shipped_scales(name: str) -> list[int]:
     return sorted(int(match[1]) for match in found if match)
 
 
+def shipped_names() -> list[str]:
+    """Names of the weights that ship with the package, without their scales."""
+    return sorted({re.sub(r"-x\d+$", "", path.stem) for path in weights_folder().glob("*.safetensors")})
+
+
 def weights_name(path: Path) -> str:
     """What a file of weights is called: those that `jaxsr train` writes go by the name of their folder."""
     if path.stem not in ("weights", "best"):
@@ -77,8 +82,9 @@ def find_method(name: str, scale: int) -> Ready:
     """The method of that name, or of a file of weights.
 
     Args:
-        name: of a method; or of weights that ship with the package for some scales, for instance "fusion-sr";
-            or the path of a file that ends in ".safetensors", whose header names the method.
+        name: of a method; or of weights that ship with the package, without their scale ("fusion-sr") or
+            with it, as their cards call them ("fusion-sr-x4"); or the path of a file that ends in
+            ".safetensors", whose header names the method.
         scale: HR size over LR size; weights must be made for it.
 
     Raises:
@@ -88,13 +94,15 @@ def find_method(name: str, scale: int) -> Ready:
     if name.endswith(".safetensors"):
         path = Path(name)
         return _with_weights(weights_name(path), path, scale)
+    if (card := weights_folder() / f"{name}.safetensors").is_file():
+        return _with_weights(name, card, scale)
     scales = shipped_scales(name)
     if scale in scales:
         return _with_weights(name, weights_folder() / f"{name}-x{scale}.safetensors", scale)
     if name not in METHODS and not scales:
         raise JaxsrError(
             f"unknown method {name!r}",
-            expected="one of " + ", ".join(METHODS),
+            expected="one of " + ", ".join(dict.fromkeys([*METHODS, *shipped_names()])),
             fix="or the path of a file of weights, *.safetensors",
         )
     if scales or METHODS[name].new_net is not None:

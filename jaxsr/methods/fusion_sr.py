@@ -9,6 +9,7 @@ Normalisation, the same in training and inference:
     colour  "display": display-referred colour, sRGB(ACES(exposure I)); the output is shown as it is.
             "lighting": l = sqrt(L / (1 + L)) of the lighting L = exposure I / a, a the base colour; the
             output is turned back into L and multiplied by the HR base colour: texture is given, not learned.
+            L ends at 499, white on any screen: linear output has no brighter lights than 499 a / exposure.
     depth   0.5 + log2(d / m) / 16, clipped to [0, 1], m the geometric mean of what is not sky; sky is 1.
             Free of exposure and of the scene's scale: another unit changes nothing, a crop shifts all by a
             constant, and the contrast between two surfaces is the ratio of their depths wherever they are.
@@ -26,6 +27,7 @@ A frame that was not rendered is made from the last output: by guided reprojecti
 where base colour and normal are there, else by a plain backward warp.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from typing import Literal, get_args, get_origin, get_type_hints
@@ -43,6 +45,7 @@ from jaxsr.methods._method import Loss, Method, Net, by_rendered
 from jaxsr.nets import FusionSR, UNetSR
 from jaxsr.nets.layers import count_channels
 from jaxsr.ops import backward_warp, demodulate, from_display, modulate, to_display
+from jaxsr.perceptual import MIN_SIZE
 
 BUFFERS = ("depth", "base_color", "normal", "roughness", "metallic")
 """In the order of the network's channels."""
@@ -71,7 +74,7 @@ class Options:
     l1_weight: float = 0.0
     """Of the mean absolute error, which the paper's loss does not have."""
     perceptual_weight: float = 0.2
-    """Of LPIPS; 0 needs no perceptual weights."""
+    """Of LPIPS; 0 needs no LPIPS weights."""
     perceptual_crop: int = 64
     """LPIPS sees the middle of each crop, so many pixels square: it costs three times the network."""
 
@@ -100,12 +103,13 @@ def gbuffer_input(gbuffer: GBuffer, buffers: tuple[str, ...]) -> Float[Array, "*
 
 def compress_lighting(lighting: Float[Array, "*b"]) -> Float[Array, "*b"]:
     """l = sqrt(L / (1 + L)) in [0, 1): about as many steps in the dark as the display has."""
+    lighting = jnp.minimum(lighting, 1e6)  # infinite light is white, not NaN
     # The guard keeps the slope of the root finite at black.
     return jnp.sqrt(jnp.maximum(lighting / (1 + lighting), 1e-8))
 
 
 def expand_lighting(compressed: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """The inverse of `compress_lighting`; 0.999 and above is L = 500."""
+    """The inverse of `compress_lighting`; 0.999 and above is L = 499."""
     squared = jnp.minimum(compressed, 0.999) ** 2
     return squared / (1 - squared)
 
@@ -184,14 +188,23 @@ def middle(image: Float[Array, "b H W c"], size: int) -> Float[Array, "b h w c"]
 
 def _check(options: Options) -> None:
     """Files of weights and command lines bring any value: a wrong one must not count as the other one."""
+    for name, kind in get_type_hints(Options).items():
+        value = getattr(options, name)
+        good, expected = {
+            bool: (isinstance(value, bool), "true or false"),
+            int: (type(value) is int, "a whole number"),
+            float: (type(value) in (int, float) and 0 <= value < math.inf, "a number from 0"),
+            tuple: (isinstance(value, tuple) and all(isinstance(v, str) for v in value), "a list of names"),
+            Literal: (value in get_args(kind), " | ".join(map(str, get_args(kind)))),
+        }[get_origin(kind) or kind]
+        if not good:
+            raise JaxsrError(f"bad {name}", where=name, expected=expected, found=value)
     if unknown := [name for name in options.buffers if name not in BUFFERS]:
         raise JaxsrError(f"unknown buffer {unknown[0]!r}", where="buffers", expected=", ".join(BUFFERS))
     count_channels(options.buffers)
-    for name, kind in get_type_hints(Options).items():
-        value = getattr(options, name)
-        if get_origin(kind) is Literal and value not in get_args(kind):
-            expected = " | ".join(map(str, get_args(kind)))
-            raise JaxsrError(f"unknown {name}", where=name, expected=expected, found=value)
+    if options.perceptual_weight and options.perceptual_crop < MIN_SIZE["vgg"]:
+        found, expected = options.perceptual_crop, f"at least {MIN_SIZE['vgg']}, which LPIPS needs"
+        raise JaxsrError("bad perceptual_crop", where="perceptual_crop", expected=expected, found=found)
 
 
 def method(options: Options | None = None) -> Method:

@@ -29,6 +29,16 @@ KEEP = 3
 """Checkpoints that are kept: the last ones."""
 
 
+FOLDER = "checkpoints"
+"""In the folder of a training."""
+
+
+def has_checkpoints(out: Path) -> bool:
+    """Whether the training in this folder has a whole one."""
+    folder = out / FOLDER
+    return folder.is_dir() and any(p.name.isdigit() for p in folder.iterdir())
+
+
 class Checkpoints:
     """The checkpoints in a folder; use it in a `with` block.
 

@@ -78,11 +78,13 @@ class TrainConfig:
 
 
 SCHEDULES = ("exponential", "cosine", "constant")
-MAY_CHANGE = frozenset({"out", "cache", "data", "eval_data", "eval_every", "save_every"})
+MAY_CHANGE = frozenset({"out", "cache", "data", "eval_data", "eval_every", "save_every", "init"})
 """What a training can be resumed with another value of: nothing that the weights depend on.
 
-Of the data, the sequences count (`identity`), wherever their folders lie. `steps` is not among them, for the
-schedule ends there."""
+Of the data, the sequences count (`identity`), and of the weights that it began with their numbers, wherever
+these files lie. `steps` is not among them, for the schedule ends there."""
+MISSING = "missing"
+"""In place of the hash of `init`, where the file is no longer there."""
 
 
 def _check(name: str, good: bool, expected: str, found: object) -> None:
@@ -100,6 +102,7 @@ def describe(
         "config": json.loads(json.dumps(dataclasses.asdict(config), default=str)),
         "sequences": [identity(path) for path in trained_on],
         "evaluated": [identity(path) for path in evaluated_on],
+        "init": _hash_of(config.init),
         "made": {
             "jaxsr": jaxsr.__version__,
             "jax": jax.__version__,
@@ -115,6 +118,12 @@ def identity(path: Path) -> str:
     """Name of a sequence, and a hash of its description: it may move, but not change."""
     digest = hashlib.sha256((path / "sequence.json").read_bytes()).hexdigest()
     return f"{Sequence.open(path).name} {digest[:12]}"
+
+
+def _hash_of(file: Path | None) -> str | None:
+    if file is None:
+        return None
+    return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file.is_file() else MISSING
 
 
 def device() -> str:
@@ -185,10 +194,12 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
 
     def flat(record: dict[str, Any]) -> dict[str, Any]:
         kept = {k: v for k, v in record["config"].items() if k not in MAY_CHANGE}
-        data = {k: record[k] for k in ("method", "sequences", "evaluated")}
+        data = {k: record[k] for k in ("method", "sequences", "evaluated")} | {"init": record.get("init")}
         return data | kept | json.loads(json.dumps(record["arguments"], default=list))
 
     a, b = flat(old), flat(new)
+    if b["init"] == MISSING and a["init"] is not None:  # it has served
+        b["init"] = a["init"]
     return [
         f"{name}: {_short(a.get(name))} -> {_short(b.get(name))}"
         for name in dict.fromkeys([*a, *b])

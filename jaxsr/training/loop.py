@@ -34,8 +34,8 @@ from jaxsr.io.sequence import Sequence, prefetch
 from jaxsr.io.weights import into, load_weights, save_weights
 from jaxsr.methods import Method
 from jaxsr.methods._method import Net
-from jaxsr.training.checkpoints import Checkpoints
-from jaxsr.training.config import TrainConfig, describe, enter
+from jaxsr.training.checkpoints import FOLDER, Checkpoints, has_checkpoints
+from jaxsr.training.config import TrainConfig, describe, enter, identity
 from jaxsr.training.evaluate import Evaluator
 from jaxsr.training.record import Bar, Log
 from jaxsr.training.state import begin, inference_net, schedule
@@ -75,7 +75,10 @@ def train(
     config.check()
     _check_method(method)
     whole, parts = shardings(config.batch, devices)
-    weights, notes = (None, []) if config.init is None else _initial(method, config.init)
+    weights: Net = None
+    notes: list[str] = []
+    if config.init is not None and not has_checkpoints(config.out):
+        weights, notes = _initial(method, config.init)
     loader, evaluate = _data(method, config, quiet)
     record = describe(method, config, loader.sequences, evaluate.sequences)
     notes += enter(config.out, record)
@@ -83,7 +86,8 @@ def train(
     with contextlib.ExitStack() as stack:
         stack.callback(loader.close)
         stack.enter_context(_only_one(config.out))
-        checkpoints = stack.enter_context(Checkpoints(config.out / "checkpoints"))
+        enter(config.out, record)  # again: another process may have begun here just now
+        checkpoints = stack.enter_context(Checkpoints(config.out / FOLDER))
 
         # The state: fresh, or that of the last checkpoint. `run` is what belongs to it and is no array.
         graphdef, state = begin(method, config, weights)
@@ -215,8 +219,9 @@ def _data(method: Method, config: TrainConfig, quiet: bool) -> tuple[Loader, Eva
     sequences = find_sequences(config.data) if config.data else _sample(config, quiet)
     evaluated = find_sequences(others) if others else sequences
     held_back = 0 if others else HELD_BACK
+    seen = {identity(path) for path in others and evaluated}
     for path in sequences:
-        if others and path.resolve() in {p.resolve() for p in evaluated}:
+        if identity(path) in seen:
             raise JaxsrError("is in --data and in --eval-data", where=path, fix="evaluate on other sequences")
         if held_back and len(clip := Sequence.open(path)) < method.window + held_back:
             raise JaxsrError(
