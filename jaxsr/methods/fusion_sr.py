@@ -76,7 +76,7 @@ class Options:
     perceptual_weight: float = 0.2
     """Of LPIPS; 0 needs no LPIPS weights."""
     perceptual_crop: int = 64
-    """LPIPS sees the middle of each crop, so many pixels square: it costs three times the network."""
+    """LPIPS sees the middle of each crop, so many pixels square: it costs more a pixel than the network."""
 
 
 def normalized_depth(depth_linear: Float[Array, "*b H W 1"]) -> Float[Array, "*b H W 1"]:
