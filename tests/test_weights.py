@@ -23,6 +23,7 @@ from jaxsr.nets import FusionSR, UNetSR
 from jaxsr.nets.fusion_sr import Fusion
 from jaxsr.nets.published import PUBLISHED
 from tests.networks import drawn
+from tests.reference import golden_fusion_sr
 from tests.test_cli import error_line, run
 
 GOLDENS = Path(__file__).parents[2] / "shared" / "goldens"
@@ -211,11 +212,8 @@ def test_the_header_of_published_weights_builds_their_network(tmp_path, make, ar
         assert method.arguments[key] == value
 
 
-@pytest.mark.parametrize("name", ["fusion_sr", "unet_sr"])
-def test_converted_weights_give_the_published_output(tmp_path, name):
-    if not (source := GOLDENS / f"{name}.npz").is_file():
-        pytest.skip("the goldens of the published networks are not here")
-    out = tmp_path / "converted.safetensors"
+def converted_output(source, out, *inputs):
+    """What our network makes of published weights, by way of `jaxsr convert-weights`."""
     convert_published(source, out)
     arrays, header = load_weights(out)
     new_net = build(header["method"], header["arguments"]).new_net
@@ -223,10 +221,26 @@ def test_converted_weights_give_the_published_output(tmp_path, name):
     net = nnx.merge(graph, into(state, arrays, out))
     net.eval()
     graph, state = nnx.split(net)
+    return jax.jit(lambda state, *inputs: nnx.merge(graph, state)(*inputs))(state, *inputs)
+
+
+@pytest.mark.parametrize("name", ["fusion_sr", "unet_sr"])
+def test_converted_weights_give_the_published_output(tmp_path, name):
+    if not (source := GOLDENS / f"{name}.npz").is_file():
+        pytest.skip("the goldens of the published networks are not here")
     golden = np.load(source)
     inputs = (np.moveaxis(golden[f"in/{k}"], 1, -1) for k in ("color", "gbuffer"))
-    made = jax.jit(lambda state, *inputs: nnx.merge(graph, state)(*inputs))(state, *inputs)
+    made = converted_output(source, tmp_path / "converted.safetensors", *inputs)
     expected = np.moveaxis(golden["out/y"], 1, -1)
+    np.testing.assert_allclose(made, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_converted_weights_give_the_output_of_pytorch(tmp_path):
+    """The golden in the repository: the same network in PyTorch, smaller images."""
+    golden = dict(np.load(Path(golden_fusion_sr.__file__).with_suffix(".npz")))
+    expected = golden.pop("output")
+    np.savez(source := tmp_path / "published.npz", **golden_fusion_sr.weights(golden))
+    made = converted_output(source, tmp_path / "converted.safetensors", *golden_fusion_sr.inputs())
     np.testing.assert_allclose(made, expected, atol=1e-4 * np.abs(expected).max())
 
 

@@ -44,7 +44,7 @@ class Config:
     """Name of weights that ship, or a file of weights; {scene} in it stands for the scene's name."""
     scale: int = 4
     frame: int = 6
-    """Position in the clip; the temporal methods see those before it."""
+    """Position in the clip, counted from 1; the temporal methods see those before it."""
     scenes: tuple[str, ...] = ()
     """Of the sample; all by default."""
     out: Path = ROOT / "docs" / "images"

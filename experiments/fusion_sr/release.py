@@ -22,7 +22,7 @@ sys.path.insert(0, str(ROOT))
 import tyro  # noqa: E402
 from tyro.conf import Positional  # noqa: E402
 
-from experiments.fusion_sr.train_released import RUNS, Run  # noqa: E402
+from experiments.fusion_sr.train_released import Run, chosen  # noqa: E402
 from experiments.provenance import commit  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
@@ -51,11 +51,7 @@ def main(
         names: of the runs.
         runs: folder of the runs.
     """
-    if unknown := [name for name in names if name not in RUNS]:
-        raise JaxsrError(f"no run {unknown[0]!r}", expected=", ".join(RUNS))
-    for name, run in RUNS.items():
-        if names and name not in names:
-            continue
+    for name, run in chosen(names).items():
         file = runs / name / "weights.safetensors"
         if not names and not file.is_file():
             continue
@@ -130,7 +126,7 @@ def card(name: str, run: Run, head: dict[str, Any], sections: list[Section], wei
         "measured": time.strftime("%Y-%m-%d"),
         "day": training["made"]["date"][:10],
     }
-    return (Path(__file__).parent / "model_card.md").read_text(encoding="utf-8").format(**values)
+    return (Path(__file__).parent / "model_card.md.in").read_text(encoding="utf-8").format(**values)
 
 
 def write(path: Path, text: str) -> None:

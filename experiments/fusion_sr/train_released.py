@@ -56,6 +56,17 @@ RUNS = {
 }
 
 
+def chosen(names: tuple[str, ...]) -> dict[str, Run]:
+    """The runs of these names, all by default, in the order in which they can be made.
+
+    Raises:
+        JaxsrError: there is no such run.
+    """
+    if unknown := [name for name in names if name not in RUNS]:
+        raise JaxsrError(f"no run {unknown[0]!r}", expected=", ".join(RUNS))
+    return {name: run for name, run in RUNS.items() if not names or name in names}
+
+
 def folders_of(scenes: tuple[str, ...], data: Path) -> tuple[Path, ...]:
     """The training clips of these scenes.
 
@@ -86,11 +97,7 @@ def main(
         data: folder of the training set.
         runs: folder for the runs.
     """
-    if unknown := [name for name in names if name not in RUNS]:
-        raise JaxsrError(f"no run {unknown[0]!r}", expected=", ".join(RUNS))
-    for name, run in RUNS.items():
-        if names and name not in names:
-            continue
+    for name, run in chosen(names).items():
         start = None if run.start is None else runs / run.start / "weights.safetensors"
         config = replace(run.config, data=folders_of(run.scenes, data), out=runs / name, init=start)
         print(f"{name}: {train(fusion_sr.method(OPTIONS), config)}")
