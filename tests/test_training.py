@@ -20,6 +20,7 @@ from jaxsr.data.loader import make_loader
 from jaxsr.errors import JaxsrError
 from jaxsr.io.images import read_png
 from jaxsr.io.weights import load_weights
+from jaxsr.methods import fusion_sr
 from jaxsr.training import TrainConfig, loop
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
@@ -152,9 +153,20 @@ def test_killed_at_any_moment(data, tmp_path):
     assert_same(one, many)
 
 
-def test_two_devices_train_as_one(data):
+FUSION_SR = fusion_sr.method(fusion_sr.Options(perceptual_weight=0.0))
+
+
+@pytest.mark.parametrize(
+    ("method", "atol"),
+    [
+        pytest.param(tiny_method.method(), 1e-5, id="tiny"),
+        # Adam's first steps divide gradients by their own size, and rounding decides some that are nearly 0.
+        pytest.param(FUSION_SR, 3e-4, id="fusion-sr", marks=pytest.mark.slow),
+    ],
+)
+def test_two_devices_train_as_one(data, method, atol):
     """The same losses and weights: batch statistics are those of the whole batch, and dropout draws alike."""
-    method, config = tiny_method.method(), TrainConfig(batch=4, scale=2, crop=16, ema=0.9, clip_norm=1.0)
+    config = TrainConfig(batch=4, scale=2, crop=16, ema=0.9, clip_norm=1.0)
     loader = make_loader([data], scale=2, needs=method.needs, batch=4, crop=16, cache=data.parent / "cache")
     batches = [next(loader) for _ in range(3)]
     loader.close()
@@ -172,7 +184,7 @@ def test_two_devices_train_as_one(data):
     np.testing.assert_allclose(losses[0], losses[1], atol=1e-6)
     for one, two in zip(*nets, strict=True):
         assert len(two.sharding.device_set) == 2
-        np.testing.assert_allclose(one, two, atol=1e-5)
+        np.testing.assert_allclose(one, two, atol=atol)
 
 
 def test_batch_must_be_shared_out():
