@@ -9,7 +9,7 @@ bfloat16 is ours with bfloat16 convolutions.
 
 Training step: 8 crops of the stated size, mean absolute error, gradient, Adam, batch statistics; against the
 same in PyTorch. LPIPS: the step of `jaxsr train fusion-sr` itself (SSIM and LPIPS, from the guided start),
-8 crops, without LPIPS, with that of the middle of each crop, and with that of whole crops.
+8 crops, without LPIPS, with that of the middle of each crop (64 is the default), and with that of whole crops.
 """
 
 import functools
@@ -307,6 +307,7 @@ def main() -> None:
         questions["LPIPS"] = [
             lpips_step("without", perceptual_weight=0.0),
             lpips_step("of the middle 48x48", perceptual_crop=48),
+            lpips_step("of the middle 64x64", perceptual_crop=64),
             lpips_step("of the whole crop", perceptual_crop=10_000),
         ]
     else:
