@@ -9,7 +9,7 @@ bfloat16 is ours with bfloat16 convolutions.
 
 Training step: 8 crops of the stated size, mean absolute error, gradient, Adam, batch statistics; against the
 same in PyTorch. LPIPS: the step of `jaxsr train fusion-sr` itself (SSIM and LPIPS, from the guided start),
-8 crops, without LPIPS, with that of the middle of each crop (64 is the default), and with that of whole crops.
+8 crops, without LPIPS, with that of the middle of each crop (64 is the default), with that of whole crops.
 """
 
 import functools

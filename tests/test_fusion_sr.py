@@ -17,6 +17,7 @@ from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.methods import METHODS, build, fusion_sr, guided, guided_taau, taau
+from jaxsr.methods._network import middle
 from jaxsr.methods.fusion_sr import Options, displayed, normalized_depth, sample_offset
 from jaxsr.nets import layers
 from jaxsr.ops import backward_warp, modulate, to_display, upsample, zero_upsample
@@ -541,6 +542,6 @@ def test_the_loss_is_its_parts_on_displayed_colour(monkeypatch):
 
 def test_the_middle():
     image = jnp.arange(2 * 5 * 8 * 1.0).reshape(2, 5, 8, 1)
-    np.testing.assert_array_equal(fusion_sr.middle(image, 4), image[:, 0:4, 2:6])
-    np.testing.assert_array_equal(fusion_sr.middle(image, 6), image[:, :, 1:7])
-    np.testing.assert_array_equal(fusion_sr.middle(image, 99), image)
+    np.testing.assert_array_equal(middle(image, 4), image[:, 0:4, 2:6])
+    np.testing.assert_array_equal(middle(image, 6), image[:, :, 1:7])
+    np.testing.assert_array_equal(middle(image, 99), image)

@@ -27,10 +27,9 @@ A frame that was not rendered is made from the last output: by guided reprojecti
 where base colour and normal are there, else by a plain backward warp.
 """
 
-import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
-from typing import Literal, get_args, get_origin, get_type_hints
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -39,20 +38,19 @@ from jaxtyping import Array, Float, Int
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, GBuffer, Window
-from jaxsr.losses import lpips, ssim_loss
 from jaxsr.methods import guided, guided_taau, taau
 from jaxsr.methods._method import Loss, Method, Net, by_rendered
+from jaxsr.methods._network import ImageLoss, check_options, image_loss, last_output
 from jaxsr.nets import FusionSR, UNetSR
 from jaxsr.nets.layers import count_channels
-from jaxsr.ops import backward_warp, demodulate, from_display, modulate, to_display
-from jaxsr.perceptual import MIN_SIZE
+from jaxsr.ops import demodulate, from_display, modulate, to_display
 
 BUFFERS = ("depth", "base_color", "normal", "roughness", "metallic")
 """In the order of the network's channels."""
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(ImageLoss):
     """What is fixed when a network is made; recorded in its file of weights."""
 
     architecture: Literal["fusion", "unet"] = "fusion"
@@ -71,12 +69,6 @@ class Options:
     """Put LR samples where they lie; else at the top left of their block."""
     compute: Literal["float32", "bfloat16"] = "float32"
     """Type of the convolutions; parameters and losses are float32."""
-    l1_weight: float = 0.0
-    """Of the mean absolute error, which the paper's loss does not have."""
-    perceptual_weight: float = 0.2
-    """Of LPIPS; 0 needs no LPIPS weights."""
-    perceptual_crop: int = 64
-    """LPIPS sees the middle of each crop, so many pixels square: it costs more a pixel than the network."""
 
 
 def normalized_depth(depth_linear: Float[Array, "*b H W 1"]) -> Float[Array, "*b H W 1"]:
@@ -169,42 +161,16 @@ def loss_of(options: Options) -> Loss:
         frames = jax.tree.map(lambda x: x[:, -1], window.frames)
         shown, _ = displayed(net, frames, options)
         truth = to_display(window.truth_linear[:, -1] * frames.exposure[..., None, None, None])
-        parts = {"ssim": ssim_loss(shown, truth), "l1": jnp.mean(jnp.abs(shown - truth))}
-        total = parts["ssim"] + options.l1_weight * parts["l1"]
-        if options.perceptual_weight:
-            seen, true = (middle(x, options.perceptual_crop) for x in (shown, truth))
-            parts["lpips"] = lpips(seen, true)
-            total = total + options.perceptual_weight * parts["lpips"]
-        return total, parts
+        return image_loss(shown, truth, options)
 
     return loss
 
 
-def middle(image: Float[Array, "b H W c"], size: int) -> Float[Array, "b h w c"]:
-    """The middle of images, at most `size` pixels square. Crops are random, hence so is this."""
-    y, x = (max(n - size, 0) // 2 for n in image.shape[1:3])
-    return image[:, y : y + size, x : x + size]
-
-
 def _check(options: Options) -> None:
-    """Files of weights and command lines bring any value: a wrong one must not count as the other one."""
-    for name, kind in get_type_hints(Options).items():
-        value = getattr(options, name)
-        good, expected = {
-            bool: (isinstance(value, bool), "true or false"),
-            int: (type(value) is int, "a whole number"),
-            float: (type(value) in (int, float) and 0 <= value < math.inf, "a number from 0"),
-            tuple: (isinstance(value, tuple) and all(isinstance(v, str) for v in value), "a list of names"),
-            Literal: (value in get_args(kind), " | ".join(map(str, get_args(kind)))),
-        }[get_origin(kind) or kind]
-        if not good:
-            raise JaxsrError(f"bad {name}", where=name, expected=expected, found=value)
+    check_options(options)
     if unknown := [name for name in options.buffers if name not in BUFFERS]:
         raise JaxsrError(f"unknown buffer {unknown[0]!r}", where="buffers", expected=", ".join(BUFFERS))
     count_channels(options.buffers)
-    if options.perceptual_weight and options.perceptual_crop < MIN_SIZE["vgg"]:
-        found, expected = options.perceptual_crop, f"at least {MIN_SIZE['vgg']}, which LPIPS needs"
-        raise JaxsrError("bad perceptual_crop", where="perceptual_crop", expected=expected, found=found)
 
 
 def method(options: Options | None = None) -> Method:
@@ -215,7 +181,7 @@ def method(options: Options | None = None) -> Method:
     """
     o = options or Options()
     _check(o)
-    is_guided = {"base_color", "normal"} <= set(o.buffers)
+    init, keep, extrapolate = last_output({"base_color", "normal"} <= set(o.buffers))
 
     def new_net(rngs: nnx.Rngs) -> nnx.Module:
         parts = (*o.buffers, "estimate") if o.start == "guided" else o.buffers
@@ -232,14 +198,6 @@ def method(options: Options | None = None) -> Method:
             last.bias[...] = jnp.full_like(last.bias[...], 0.5)
         return net
 
-    def init(frame: Frame) -> guided.State | taau.State:
-        return guided.init(frame) if is_guided else taau.init(frame)
-
-    def keep(image: Array, frame: Frame) -> guided.State | taau.State:
-        depth = frame.hr.depth_linear
-        history = taau.State(image, jnp.ones_like(depth), depth)
-        return guided.State(history, *guided.surface(frame.hr)) if is_guided else history
-
     def upscale(net: Net, state: object, frame: Frame) -> tuple[object, Array]:
         if frame.scale == 1:
             return keep(frame.color_linear, frame), frame.color_linear
@@ -247,12 +205,6 @@ def method(options: Options | None = None) -> Method:
         model.eval()
         one = jax.tree.map(lambda x: jnp.asarray(x)[None], frame)
         image = displayed(model, one, o)[1][0]
-        return keep(image, frame), image
-
-    def extrapolate(net: Net, state: guided.State | taau.State, frame: Frame) -> tuple[object, Array]:
-        if isinstance(state, guided.State):
-            return guided.extrapolate(guided.Options(), state, frame)
-        image = backward_warp(state.image, frame.hr.motion_px)
         return keep(image, frame), image
 
     lr, hr = {"lr.color"}, {f"hr.{name}" for name in o.buffers} | {"hr.motion"}
