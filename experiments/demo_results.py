@@ -22,6 +22,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description, run_demo
+from jaxsr.evaluation.embedding import ImageOrPath, to_bytes
 from jaxsr.evaluation.progress import bars
 from jaxsr.evaluation.sample import unpack_sample
 from jaxsr.evaluation.sections import Section
@@ -125,9 +126,14 @@ def readme_block(document: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def pixels(image: ImageOrPath) -> np.ndarray:
+    """Of an image in memory or on disk, in [0, 1]."""
+    return to_bytes(image).astype(np.float32) / 255
+
+
 def busiest(truth: np.ndarray, rivals: list[np.ndarray]) -> tuple[int, int]:
     """Top left of the crop where the methods differ most from the truth in sum: the same crop for all."""
-    error = sum(((np.asarray(r) - truth) ** 2).sum(-1) for r in rivals)
+    error = sum(((r - truth) ** 2).sum(-1) for r in rivals)
     total = np.pad(np.cumsum(np.cumsum(error, 0), 1), ((1, 0), (1, 0)))
     w, h = CROP
     sums = total[h:, w:] - total[:-h, w:] - total[h:, :-w] + total[:-h, :-w]
@@ -138,14 +144,14 @@ def busiest(truth: np.ndarray, rivals: list[np.ndarray]) -> tuple[int, int]:
 def strip(section: Section, frame: int) -> np.ndarray:
     """The truth with the crop marked, then the crop of the input, each method and the truth, enlarged."""
     i = list(section.frames).index(frame)
-    truth = np.asarray(section.truths[i])
+    truth = pixels(section.truths[i])
     tracks = [t for t in section.tracks if t.name not in ("nearest", "bicubic")]
     labels = {n: label.replace("`", "") for n, label in LABELS[task_of(section)].items()}
-    images = {labels.get(t.name, t.name): np.asarray(t.images[i]) for t in tracks}
+    images = {labels.get(t.name, t.name): pixels(t.images[i]) for t in tracks}
     x, y = busiest(truth, list(images.values()))
     (w, h), zoom = CROP, 4
     given = section.inputs[i]
-    low = None if given is None else np.asarray(given)
+    low = None if given is None else pixels(given)
     if low is not None:
         s = truth.shape[0] // low.shape[0]
         images = {"input": low.repeat(s, 0).repeat(s, 1), **images}

@@ -4,9 +4,12 @@ import json
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from experiments.demo_results import BEGIN, END, readme_block
+from experiments.demo_results import BEGIN, END, picture, readme_block
+from jaxsr.evaluation.sections import Section, Track
+from jaxsr.io.images import write_png
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -36,6 +39,37 @@ def test_better_methods_are_better_on_every_scene_and_scale():
         assert psnr["guided-taau"] > psnr["taau"]
         if subset == "extrapolated":
             assert psnr["guided"] > psnr["taau"]
+
+
+def test_pictures_of_frames_in_memory_and_on_disk_are_alike(tmp_path):
+    rng = np.random.default_rng(0)
+    truth = np.rint(rng.random((80, 128, 3)) * 255) / 255
+    low, made = truth[::2, ::2], truth.copy()
+    made[20:60, 40:104] = 0
+
+    def section(convert):
+        tracks = [Track(name, [convert(name, image)], {"psnr": [20.0]}) for name, image in images.items()]
+        truths, inputs = [convert("truth", truth)], [convert("input", low)]
+        return Section(
+            "a",
+            [6],
+            truths,
+            tracks,
+            inputs=inputs,
+            extrapolated=[False],
+            meta={"sequence": "a-0", "scale": 2},
+        )
+
+    def on_disk(name, image):
+        write_png(tmp_path / f"{name}.png", np.rint(image * 255).astype(np.uint8))
+        return tmp_path / f"{name}.png"
+
+    images = {"bilinear": made, "taau": truth}
+    in_memory = picture([section(lambda _, image: image)], "super-resolution", 6)
+    np.testing.assert_array_equal(in_memory, picture([section(on_disk)], "super-resolution", 6))
+    # The truth, and crops of the input, both methods and the truth; the first method is black where it errs.
+    assert in_memory.shape == (40 * 4 + 22 + 4, 256 + 4 + 4 * (256 + 4), 3)
+    assert not in_memory[30:150, 540:760].any()
 
 
 PAGES = sorted(
