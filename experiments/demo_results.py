@@ -190,6 +190,10 @@ def main(config: Config) -> None:
             paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)
             out = Path(folder) / f"x{scale}"
             sections += run_demo(out, paths, scale=scale, lpips=True, progress=progress)
+        pictures = {}  # while the frames are there
+        for task in LABELS:
+            shown = [s for s in sections if s.meta["scale"] == (4 if task == "super-resolution" else 2)]
+            pictures[task] = picture(shown, task, config.frame)
     state = commit()
     meta = description(
         commit=state,
@@ -213,9 +217,8 @@ def main(config: Config) -> None:
         lines += [f"{task.capitalize()}, {which}:", "", *table(sections, task), ""]
     with atomic_path(RESULTS / "demo.md") as temporary:
         temporary.write_text("\n".join(lines))
-    for task in LABELS:
-        shown = [s for s in sections if s.meta["scale"] == (4 if task == "super-resolution" else 2)]
-        write_png(IMAGES / f"demo_{task}.png", picture(shown, task, config.frame))
+    for task, image in pictures.items():
+        write_png(IMAGES / f"demo_{task}.png", image)
     readme = (ROOT / "README.md").read_text()
     before, _, rest = readme.partition(BEGIN)
     _, _, after = rest.partition(END)

@@ -519,7 +519,7 @@ def test_the_loss_is_its_parts_on_displayed_colour(monkeypatch):
         seen.append((pred, target))
         return jnp.mean(jnp.abs(pred - target))
 
-    monkeypatch.setattr(fusion_sr, "lpips", fake)
+    monkeypatch.setattr("jaxsr.methods._network.lpips", fake)
     options = Options(start="nothing", color="display", perceptual_crop=12, l1_weight=0.5)
     (frame, truth), (other, wrong) = frame_at(0), frame_at(1)
     frame = frame._replace(exposure=jnp.asarray(0.5))
