@@ -85,6 +85,7 @@ def onnxruntime_(inputs: Inputs) -> Prepared:
     model = to_onnx(bare, inputs=[color.shape, gbuffer.shape])
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = len(os.sched_getaffinity(0))
+    options.log_severity_level = 3  # it warns of shapes that it then gets right
     session = onnxruntime.InferenceSession(
         model.SerializeToString(), options, providers=["CPUExecutionProvider"]
     )

@@ -211,7 +211,7 @@ def lpips_features(
 ) -> Features:
     """u_l of a target, without gradient, for `lpips_from_features`.
 
-    To keep them saves a forward pass, about a third of `lpips` with its gradient; over VGG-16 they are 122
+    To keep them saves one pass of the three in `lpips` with its gradient; over VGG-16 they are 122
     numbers a pixel, 488 bytes.
 
     Raises:

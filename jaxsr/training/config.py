@@ -38,7 +38,7 @@ class TrainConfig:
     """Folder for converted sequences; ~/.cache/jaxsr by default."""
     scale: int = 4
     """HR size over LR size."""
-    steps: int = 600
+    steps: int = 500
     """Updates of the weights."""
     batch: int = 8
     """Crops in a step, over all devices."""

@@ -156,6 +156,8 @@ def plot_curve(path: Path, rows: list[dict[str, float]]) -> None:
     top.plot(losses[:, 0], _smooth(losses[:, 1]), color="tab:blue")
     if (losses[:, 1] > 0).all():
         top.set_yscale("log")
+        top.yaxis.set_major_formatter("{x:.3g}")
+        top.yaxis.set_minor_formatter("{x:.3g}")
     top.set_ylabel("loss")
     bottom.plot(scores[:, 0], scores[:, 1], color="tab:green", marker=".")
     bottom.set_ylabel("PSNR of the evaluation (dB)")
