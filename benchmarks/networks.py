@@ -15,8 +15,10 @@ same in PyTorch. LPIPS: the step of `jaxsr train fusion-sr` itself (SSIM and LPI
 import functools
 import importlib.util
 import itertools
+import multiprocessing
 import os
 import time
+from concurrent.futures import ProcessPoolExecutor
 from typing import Any, NamedTuple
 
 import jax
@@ -75,22 +77,28 @@ def ours(name: str, dtype: Any = jnp.float32) -> Variant:
     return Variant(name, build)
 
 
-def onnxruntime_(inputs: Inputs) -> Prepared:
-    import onnxruntime
+def exported(*shapes: tuple[int, ...]) -> bytes:
+    """The network as ONNX, for inputs of these shapes."""
     from jax2onnx import to_onnx
 
     fn, state = forward(network())
+    return to_onnx(functools.partial(fn, state), inputs=list(shapes)).SerializeToString()
+
+
+def onnxruntime_(inputs: Inputs) -> Prepared:
+    import onnxruntime
+
+    fn, state = forward(network())
     color, gbuffer, _ = images(inputs)
-    bare = functools.partial(fn, state)
-    model = to_onnx(bare, inputs=[color.shape, gbuffer.shape])
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as other:  # JAX is changed by jax2onnx
+        model = other.submit(exported, color.shape, gbuffer.shape).result()
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = len(os.sched_getaffinity(0))
     options.log_severity_level = 3  # it warns of shapes that it then gets right
-    session = onnxruntime.InferenceSession(
-        model.SerializeToString(), options, providers=["CPUExecutionProvider"]
-    )
+    session = onnxruntime.InferenceSession(model, options, providers=["CPUExecutionProvider"])
     feed = {given.name: x for given, x in zip(session.get_inputs(), (color, gbuffer), strict=True)}
-    np.testing.assert_allclose(session.run(None, feed)[0], jax.jit(bare)(color, gbuffer), atol=1e-3)
+    expected = jax.jit(fn)(state, color, gbuffer)
+    np.testing.assert_allclose(session.run(None, feed)[0], expected, atol=1e-3)
     return Prepared(lambda: session.run(None, feed))
 
 

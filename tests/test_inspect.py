@@ -198,7 +198,22 @@ def test_missing_needed_layers_are_bad(tmp_path, layer, whole):
     write_exr(seq.path / "x2/0002.exr", {n: x for n, x in channels.items() if n not in lost})
     report = inspect(Sequence.open(seq.path, check=False))
     assert report.finding("files").level == report.level == "bad"
-    assert f"x2/0002.exr: missing layer {layer!r}" in report.finding("files").text
+    expected = f"missing layer {layer!r}" if whole else f"layer {layer!r} lacks channel"
+    assert f"x2/0002.exr: {expected}" in report.finding("files").text
+
+
+@pytest.mark.parametrize("frame", [1, 3])
+@pytest.mark.parametrize("channels", [["base_color.G"], ["base_color.R", "base_color.G", "base_color.B"]])
+def test_a_buffer_that_one_frame_lacks(tmp_path, frame, channels):
+    """A method would stop there, so it must not be said to run."""
+    sequence = make_sequence(tmp_path, frames=3, size=SIZE)
+    file = tmp_path / "hr" / f"{frame:04d}.exr"
+    found, _ = read_exr(file)
+    write_exr(file, {name: x for name, x in found.items() if name not in channels})
+    report = inspect(Sequence.open(sequence.path, check=False), {"any": frozenset({"hr.base_color"})})
+    text = report.finding("files").text
+    assert (report.level, str(file) in text, "base_color" in text) == ("bad", True, True)
+    assert report.missing["any"] == ([] if len(channels) == 1 else ["hr.base_color"])
 
 
 def test_nan_in_motion_alone_is_bad_and_no_missing_motion(tmp_path):

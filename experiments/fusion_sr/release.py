@@ -109,12 +109,14 @@ def table(sections: list[Section]) -> list[str]:
 
 def card(name: str, run: Run, head: dict[str, Any], sections: list[Section], weights: Path) -> str:
     """The model card as Markdown."""
-    count = sum(math.prod(array.shape) for array in load_weights(weights)[0].values())
+    sizes = {name: math.prod(array.shape) for name, array in load_weights(weights)[0].items()}
+    statistics = sum(size for name, size in sizes.items() if name.endswith((".mean", ".var")))
     training, arguments = head["training"], head["arguments"]
     values = {**arguments, **training["config"], **training["made"]}
     values |= {
         "name": name,
-        "count": f"{count:,}",
+        "weights": f"{sum(sizes.values()) - statistics:,}",
+        "statistics": f"{statistics:,}",
         "megabytes": f"{weights.stat().st_size / 1e6:.2f}",
         "buffers": ", ".join(arguments["buffers"]),
         "clips": len(training["sequences"]),

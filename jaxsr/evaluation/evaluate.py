@@ -49,14 +49,14 @@ def part(sequence: FrameSequence, frames: tuple[int, int] | None) -> FrameSequen
     """A sequence of the frames with numbers in a range alone, ends included; it begins anew.
 
     Raises:
-        JaxsrError: there are none.
+        JaxsrError: there are none, or not all.
     """
     if frames is None:
         return sequence
     infos = [info for info in sequence.infos if frames[0] <= info.index <= frames[1]]
-    if not infos:
+    if not infos or frames[0] < sequence.infos[0].index or frames[1] > sequence.infos[-1].index:
         raise JaxsrError(
-            "no frame in the range",
+            "the range has frames that the sequence has not" if infos else "no frame in the range",
             where=sequence.path,
             expected=f"some of {sequence.infos[0].index}:{sequence.infos[-1].index}",
             found=f"{frames[0]}:{frames[1]}",

@@ -7,7 +7,7 @@ at all. It changes nothing. `print_report` shows it to a person, `Report.to_json
 
 import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,6 +82,7 @@ def inspect(
     chosen = _choose(len(sequence), max_frames)
     last: tuple[int, dict[str, dict[str, np.ndarray]]] | None = None
     pairs = []
+    layers: dict[str, dict[int, Set[str]]] = {resolution: {} for resolution in sequence.resolutions}
     for i in chosen:
         images = {}
         for resolution in sequence.resolutions:
@@ -89,12 +90,16 @@ def inspect(
                 images[resolution] = _read(sequence, i, resolution, stats)
             except JaxsrError as e:
                 faults.append(str(e))
+                continue
+            layers[resolution][i] = images[resolution].keys()
         _single(sequence, i, images, evidence)
         if last is not None and last[0] == i - 1 and not sequence.infos[i].cut:
             _pair(sequence, i, images, last[1], evidence)
             if "hr" in images and "hr" in last[1]:
                 pairs.append((i, images["hr"]))
         last = (i, images)
+    absent = _absent(sequence, layers)
+    faults += map(str, absent.values())
     findings = [judge_files(sequence, chosen, faults), *judge_values(stats, evidence)]
     motion, convention = judge_motion(evidence.motion)
     findings += [motion, judge_camera(sequence, pairs[-1:], convention)]
@@ -108,7 +113,8 @@ def inspect(
             f"{len(far)} frames state more than half an LR pixel, first frame {far[0].index}: ({x:g}, {y:g})"
         )
         findings.append(Finding("jitter range", "bad", f"{text}; expected each within [-0.5, 0.5]"))
-    missing = {name: _lacks(sequence, set(wanted), stats) for name, wanted in (needs or {}).items()}
+    whole = stats.keys() - absent.keys()
+    missing = {name: _lacks(sequence, set(wanted), whole) for name, wanted in (needs or {}).items()}
     return Report(
         path=str(sequence.path),
         name=sequence.name,
@@ -165,7 +171,8 @@ def _choose(count: int, most: int) -> list[int]:
 
 
 def _read(sequence: Sequence, i: int, resolution: str, stats: dict) -> dict[str, np.ndarray]:
-    channels, _ = read_exr(frame_file(sequence.path, resolution, sequence.infos[i].index))
+    where = frame_file(sequence.path, resolution, sequence.infos[i].index)
+    channels, _ = read_exr(where)
     stored = {
         layer: [channels[f"{layer}.{c}"] for c in letters]
         for layer, letters in LAYERS.items()
@@ -179,7 +186,10 @@ def _read(sequence: Sequence, i: int, resolution: str, stats: dict) -> dict[str,
         stats.setdefault((resolution, layer), new).add(x, sky)
     scale = 1 if resolution == "hr" else int(resolution[1:])
     expected = (sequence.size[1] // scale, sequence.size[0] // scale)
-    where = frame_file(sequence.path, resolution, sequence.infos[i].index)
+    for layer, letters in LAYERS.items():
+        lost = [f"{layer}.{c}" for c in letters if f"{layer}.{c}" not in channels]
+        if 0 < len(lost) < len(letters):
+            raise JaxsrError(f"layer {layer!r} lacks channel {lost[0]!r}", where=where, fix="export it again")
     for layer in ("depth", "motion") if resolution == "hr" else ("color", "depth", "motion"):
         if layer not in images:
             found = ", ".join(images) or "none that jaxsr knows"
@@ -233,10 +243,26 @@ def _pair(
                 to.lr_motion.setdefault(scale, []).append(errors)
 
 
-def _lacks(sequence: Sequence, wanted: set[str], stats: Mapping[tuple[str, str], BufferStats]) -> list[str]:
-    have = {f"hr.{layer}" for place, layer in stats if place == "hr"}
+def _absent(
+    sequence: Sequence, layers: Mapping[str, Mapping[int, Set[str]]]
+) -> dict[tuple[str, str], JaxsrError]:
+    """The layers that some frames have and others lack: by resolution and layer, the first that lacks it."""
+    found = {}
+    for resolution, of in layers.items():
+        for layer in LAYERS:
+            lack = [i for i, have in of.items() if layer not in have]
+            if 0 < len(lack) < len(of):
+                where = frame_file(sequence.path, resolution, sequence.infos[lack[0]].index)
+                others = f"in {len(of) - len(lack)} other frames"
+                found[resolution, layer] = JaxsrError(f"missing layer {layer!r}", where=where, found=others)
+    return found
+
+
+def _lacks(sequence: Sequence, wanted: set[str], whole: Set[tuple[str, str]]) -> list[str]:
+    """Of the wanted buffers those that not every frame has; `whole` holds resolutions and layers."""
+    have = {f"hr.{layer}" for place, layer in whole if place == "hr"}
     small = [r for r in sequence.resolutions if r != "hr"] or ["hr"]
-    have |= {f"lr.{layer}" for layer in LAYERS if all((place, layer) in stats for place in small)}
+    have |= {f"lr.{layer}" for layer in LAYERS if all((place, layer) in whole for place in small)}
     return sorted(wanted - have)
 
 

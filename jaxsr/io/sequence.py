@@ -266,6 +266,11 @@ def _read_head(path: Path) -> dict[str, Any]:
     if not path.is_dir():
         raise JaxsrError("no such folder", where=path, expected="a sequence")
     if not file.is_file():
+        inside = sorted(file.parent.name for file in path.glob("*/sequence.json"))
+        if inside:
+            raise JaxsrError(
+                "a folder of sequences, where one is wanted", where=path, fix=f"name one: {', '.join(inside)}"
+            )
         strays = next(iter(sorted(path.rglob("*.exr"))), None)
         raise JaxsrError(
             "not a sequence",

@@ -176,6 +176,10 @@ def train(
                 bar.pause()
             if stopped and not last:
                 bar.say(f"stopped after step {step}, which is saved; the same command goes on from here")
+                before = step - step % config.eval_every
+                if before < step:
+                    written = f"is of step {before}" if before else "is not written yet"
+                    bar.say(f"{WEIGHTS}, written at evaluations, {written}")
                 raise KeyboardInterrupt
 
         file = config.out / WEIGHTS

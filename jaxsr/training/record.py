@@ -141,17 +141,14 @@ def _read(file: Path) -> list[dict[str, float]]:
 
 
 def plot_curve(path: Path, rows: list[dict[str, float]]) -> None:
-    """Loss (each row, and smoothed) on a logarithmic axis over the PSNR of the evaluations, as PNG."""
+    """Loss (each row, and smoothed) on a logarithmic axis over PSNR and SSIM of the evaluations, as PNG."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
     losses = np.array([(row["step"], row["loss"]) for row in rows if "loss" in row], float).reshape(-1, 2)
-    scores = np.array([(row["step"], row["eval/psnr"]) for row in rows if "eval/psnr" in row], float).reshape(
-        -1, 2
-    )
-    figure = Figure(figsize=(7, 5), layout="constrained")
+    figure = Figure(figsize=(7, 7), layout="constrained")
     FigureCanvasAgg(figure)
-    top, bottom = figure.subplots(2, 1, sharex=True)
+    top, *below = figure.subplots(3, 1, sharex=True)
     top.plot(losses[:, 0], losses[:, 1], color="tab:blue", alpha=0.35, linewidth=0.8)
     top.plot(losses[:, 0], _smooth(losses[:, 1]), color="tab:blue")
     if (losses[:, 1] > 0).all():
@@ -159,10 +156,12 @@ def plot_curve(path: Path, rows: list[dict[str, float]]) -> None:
         top.yaxis.set_major_formatter("{x:.3g}")
         top.yaxis.set_minor_formatter("{x:.3g}")
     top.set_ylabel("loss")
-    bottom.plot(scores[:, 0], scores[:, 1], color="tab:green", marker=".")
-    bottom.set_ylabel("PSNR of the evaluation (dB)")
-    bottom.set_xlabel("step")
-    for axes in (top, bottom):
+    for axes, key, label in zip(below, ("psnr", "ssim"), ("PSNR (dB)", "SSIM"), strict=True):
+        scores = [(row["step"], row[f"eval/{key}"]) for row in rows if f"eval/{key}" in row]
+        axes.plot(*np.array(scores, float).reshape(-1, 2).T, color="tab:green", marker=".")
+        axes.set_ylabel(f"{label} of the evaluation")
+    below[-1].set_xlabel("step")
+    for axes in (top, *below):
         axes.grid(alpha=0.3)
     with atomic_path(path) as temporary:
         figure.savefig(temporary, format="png", dpi=110)
