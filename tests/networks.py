@@ -7,6 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from flax import nnx
 
+SMALL: dict[str, dict[str, int]] = {
+    "rcan": {"groups": 1, "blocks": 2, "features": 8, "reduction": 4},
+    "rrn": {"blocks": 1, "features": 8, "frames": 3},
+}
+"""Options of methods whose networks are large by default."""
+
 
 def drawn(make: Callable[..., Any], seed: int = 0) -> Any:
     """`make(rngs=...)` as it starts: Xavier kernels, drawn by NumPy, biases 0, scales 1.
@@ -18,7 +24,7 @@ def drawn(make: Callable[..., Any], seed: int = 0) -> Any:
     for path, variable in nnx.to_flat_state(state):
         shape = variable.get_value().shape
         if path[-1] == "kernel":
-            bound = np.sqrt(6 / (np.prod(shape[:-2]) * sum(shape[-2:])))
+            bound = np.sqrt(6 / (np.prod(shape[-4:-2]) * sum(shape[-2:])))  # stacked layers have more axes
             value = rng.uniform(-bound, bound, shape)
         else:
             value = np.full(shape, path[-1] in ("scale", "var"))

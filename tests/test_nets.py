@@ -11,7 +11,17 @@ from flax import nnx
 
 from jaxsr.errors import JaxsrError
 from jaxsr.nets import FusionSR, UNetSR
-from jaxsr.nets.layers import ShallowFeatures, UpConcat, UpConv, conv, conv_beside
+from jaxsr.nets.layers import (
+    XAVIER,
+    LoopConv,
+    ShallowFeatures,
+    UpConcat,
+    UpConv,
+    conv,
+    conv_beside,
+    stacked,
+    through,
+)
 from tests.networks import drawn
 
 NETS = {"fusion": FusionSR, "unet": UNetSR}
@@ -248,6 +258,37 @@ def test_convolution_of_parts_is_that_of_the_whole():
     layer.bias[...] = jnp.arange(4.0)
     x = jax.random.normal(jax.random.key(0), (2, 6, 4, 5))
     np.testing.assert_allclose(conv_beside(layer, x[..., :2], x[..., 2:]), layer(x), atol=1e-5)
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+def test_a_convolution_for_loops_is_flax_s_with_its_gradient(dtype):
+    layer = LoopConv(3, 5, init=XAVIER, dtype=dtype, rngs=nnx.Rngs(0))
+    layer.bias[...] = jnp.arange(5.0)
+    x, cotangent = (jax.random.normal(jax.random.key(k), (2, 5, 4, c)) for k, c in enumerate((3, 5)))
+    found = []
+    for call in (LoopConv.__call__, nnx.Conv.__call__):
+        graph, params = nnx.split(layer)
+
+        def loss(params, x, call=call, graph=graph):
+            made = call(nnx.merge(graph, params), x).astype(jnp.float32)
+            return jnp.sum(made * cotangent), made
+
+        found.append(jax.value_and_grad(loss, argnums=(0, 1), has_aux=True)(params, x))
+    for ours, expected in zip(*map(jax.tree.leaves, found), strict=True):
+        scale = np.abs(expected).max()
+        np.testing.assert_allclose(ours, expected, atol=scale * (1e-6 if dtype == jnp.float32 else 2e-2))
+
+
+def test_stacked_modules_are_run_one_after_the_other():
+    many = stacked(3, lambda rngs: LoopConv(4, 4, init=XAVIER, dtype=jnp.float32, rngs=rngs), nnx.Rngs(0))
+    assert many.kernel.shape == (3, 3, 3, 4, 4)
+    x = y = jax.random.normal(jax.random.key(0), (1, 4, 3, 4))
+    for k in range(3):
+        one = LoopConv(4, 4, init=XAVIER, dtype=jnp.float32, rngs=nnx.Rngs(1))
+        one.kernel[...] = many.kernel[k]
+        y = one(y)
+    assert np.abs(many.kernel[0] - many.kernel[1]).max() > 0.01  # each was drawn for itself
+    np.testing.assert_allclose(through(x, many), y, atol=1e-5)
 
 
 def test_upsampling_is_flax_s_transposed_convolution():

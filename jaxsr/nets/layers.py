@@ -1,16 +1,18 @@
 """Blocks that several networks share.
 
-Features are `[B, H, W, C]`. Kernels start Xavier-uniform (Glorot and Bengio 2010), biases at zero. Parameters
-are float32; convolutions compute in the dtype of the block, batch norm and squeeze-and-excitation in float32,
-because means over an image need the digits. Padding is explicit: a stride-2 convolution with 3x3 kernel pads
-one pixel on every side, as PyTorch's does, and not only at the bottom and right, as "SAME" would.
+Features are `[B, H, W, C]`. Kernels start Xavier-uniform (Glorot and Bengio 2010) unless a network begins
+otherwise, biases at zero. Parameters are float32; convolutions compute in the dtype of the block, batch norm
+and squeeze-and-excitation in float32, because means over an image need the digits. Padding is explicit: a
+stride-2 convolution with 3x3 kernel pads one pixel on every side, as PyTorch's does, and not only at the
+bottom and right, as "SAME" would.
 
-Two blocks compute otherwise than their textbook form, for the time it takes on a CPU: `conv_beside` and
-`UpConv` say why.
+Some blocks compute otherwise than their textbook form, for the time it takes on a CPU: `conv_beside`,
+`convolve` and `UpConv` say why.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +25,7 @@ from jaxsr.errors import JaxsrError
 CHANNELS = {"depth": 1, "base_color": 3, "normal": 3, "roughness": 1, "metallic": 1, "estimate": 3}
 """What a G-buffer may consist of, and how many channels each part has; "estimate" guesses the colour."""
 XAVIER = nnx.initializers.xavier_uniform()
+Module = TypeVar("Module", bound=nnx.Module)
 
 
 def conv(
@@ -96,12 +99,79 @@ def check_shape(scale: int | None, down_kernel: int) -> None:
         raise JaxsrError("bad kernel", where="down_kernel", expected="2 | 3", found=down_kernel)
 
 
+def check_counts(**counts: int) -> None:
+    """Raise JaxsrError, which names the first bad one, unless there is at least one of each."""
+    for name, count in counts.items():
+        if count < 1:
+            raise JaxsrError(f"bad {name}", where=name, expected="a whole number of at least 1", found=count)
+
+
 def check_channels(gbuffer: Float[Array, "b h w c"], channels: int) -> None:
     """Raise JaxsrError unless the G-buffer has so many channels."""
     if gbuffer.shape[-1] != channels:
         raise JaxsrError(
             "wrong number of channels", where="gbuffer", expected=channels, found=gbuffer.shape[-1]
         )
+
+
+def _convolution(x: Array, kernel: Array, pad: int) -> Array:
+    numbers = ("NHWC", "HWIO", "NHWC")
+    return jax.lax.conv_general_dilated(
+        x, kernel, (1, 1), ((pad, pad), (pad, pad)), dimension_numbers=numbers
+    )
+
+
+@jax.custom_vjp
+def convolve(x: Float[Array, "b h w c"], kernel: Float[Array, "k k c d"]) -> Float[Array, "b h w d"]:
+    """A convolution of odd size that keeps the size of the image."""
+    return _convolution(x, kernel, kernel.shape[0] // 2)
+
+
+def _convolve_forward(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
+    return convolve(x, kernel), (x, kernel)
+
+
+def _convolve_backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Array, Array]:
+    pad = saved[1].shape[0] // 2
+
+    def usual(x: Array, kernel: Array, gradient: Array) -> tuple[Array, Array]:
+        return jax.vjp(lambda x, kernel: _convolution(x, kernel, pad), x, kernel)[1](gradient)
+
+    def in_forward_layout(x: Array, kernel: Array, gradient: Array) -> tuple[Array, Array]:
+        of_x = _convolution(gradient, kernel[::-1, ::-1].swapaxes(2, 3), pad)
+        of_kernel = _convolution(x.transpose(3, 1, 2, 0), gradient.transpose(1, 2, 0, 3), pad)
+        return of_x, of_kernel.transpose(1, 2, 0, 3)
+
+    # In a loop XLA has no fast convolution of another layout for CPUs: training would take 20 times as long.
+    return jax.lax.platform_dependent(*saved, gradient, cpu=in_forward_layout, default=usual)
+
+
+convolve.defvjp(_convolve_forward, _convolve_backward)
+
+
+class LoopConv(nnx.Conv):
+    """A 3x3 convolution with stride 1 whose gradient is fast in a loop, too: `jax.lax.scan`, `through`."""
+
+    def __init__(self, inputs: int, outputs: int, *, init: nnx.Initializer, dtype: DTypeLike, rngs: nnx.Rngs):
+        super().__init__(inputs, outputs, (3, 3), dtype=dtype, kernel_init=init, rngs=rngs)
+
+    def __call__(  # type: ignore[override]  # nothing about sharding
+        self, inputs: Float[Array, "b h w c"]
+    ) -> Float[Array, "b h w d"]:
+        assert self.bias is not None
+        bias = self.bias[...].astype(self.dtype).reshape(1, 1, 1, -1)
+        return convolve(inputs.astype(self.dtype), self.kernel[...].astype(self.dtype)) + bias
+
+
+def stacked(count: int, make: Callable[[nnx.Rngs], Module], rngs: nnx.Rngs) -> Module:
+    """So many modules as one, whose arrays have a leading axis; `through` runs them in a loop."""
+    return nnx.split_rngs(splits=count)(nnx.vmap(make, in_axes=0, out_axes=0))(rngs)
+
+
+@nnx.scan(in_axes=(nnx.Carry, 0), out_axes=nnx.Carry)
+def through(x: Float[Array, "b h w c"], modules: Callable[[Array], Array]) -> Float[Array, "b h w c"]:
+    """Features through `stacked` modules, one after the other."""
+    return modules(x)
 
 
 class ConvPair(nnx.Module):
@@ -168,12 +238,12 @@ class BatchNorm(nnx.BatchNorm):
 
 
 class SqueezeExcite(nnx.Module):
-    """Channels scaled by a gate in (0, 1) that sees all of their means (Hu et al. 2018), without biases."""
+    """Channels scaled by a gate in (0, 1) that sees all of their means (Hu et al. 2018)."""
 
-    def __init__(self, channels: int, reduction: int = 16, *, rngs: nnx.Rngs):
+    def __init__(self, channels: int, reduction: int = 16, *, bias: bool = False, rngs: nnx.Rngs):
         middle = channels // reduction
-        self.squeeze = nnx.Linear(channels, middle, use_bias=False, kernel_init=XAVIER, rngs=rngs)
-        self.excite = nnx.Linear(middle, channels, use_bias=False, kernel_init=XAVIER, rngs=rngs)
+        self.squeeze = nnx.Linear(channels, middle, use_bias=bias, kernel_init=XAVIER, rngs=rngs)
+        self.excite = nnx.Linear(middle, channels, use_bias=bias, kernel_init=XAVIER, rngs=rngs)
 
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w c"]:
         mean = jnp.mean(x, axis=(1, 2), keepdims=True, dtype=jnp.float32)
