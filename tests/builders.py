@@ -12,6 +12,7 @@ from jaxsr.io.sequence import Sequence
 from jaxsr.io.weights import save_weights
 from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter
 from jaxsr.methods import build
+from tests.networks import SMALL
 
 Layers = dict[str, np.ndarray]
 
@@ -77,7 +78,7 @@ def make_sequence(
 
 def random_weights(path: Path, *, scale: int, method: str = "fusion-sr", seed: int = 0) -> Path:
     """A file of weights as training writes it, but of a network that has learned nothing."""
-    made = build(method, {})
+    made = build(method, SMALL[method] | {"scale": scale} if method in SMALL else {})
     assert made.new_net is not None
     new_net, rng = made.new_net, np.random.default_rng(seed)
     # Not what `new_net` begins with: that may be made to change nothing, and takes long to make.

@@ -20,7 +20,7 @@ from jaxsr.data.loader import make_loader
 from jaxsr.errors import JaxsrError
 from jaxsr.io.images import read_png
 from jaxsr.io.weights import load_weights
-from jaxsr.methods import fusion_sr
+from jaxsr.methods import build, fusion_sr
 from jaxsr.training import TrainConfig, loop
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
@@ -29,6 +29,7 @@ from jaxsr.training.state import begin, inference_net, optimizer, schedule
 from jaxsr.training.step import averaged, make_step, shardings
 from tests import tiny_method
 from tests.builders import make_sequence
+from tests.networks import SMALL
 from tests.test_cli import error_line, run
 
 ROOT = Path(__file__).parents[1]
@@ -162,12 +163,14 @@ FUSION_SR = fusion_sr.method(fusion_sr.Options(perceptual_weight=0.0))
         pytest.param(tiny_method.method(), 1e-5, id="tiny"),
         # Adam's first steps divide gradients by their own size, and rounding decides some that are nearly 0.
         pytest.param(FUSION_SR, 3e-4, id="fusion-sr", marks=pytest.mark.slow),
+        *(pytest.param(build(name, SMALL[name] | {"scale": 2}), 1e-3, id=name) for name in SMALL),
     ],
 )
 def test_two_devices_train_as_one(data, method, atol):
     """The same losses and weights: batch statistics are those of the whole batch, and dropout draws alike."""
     config = TrainConfig(batch=4, scale=2, crop=16, ema=0.9, clip_norm=1.0)
-    loader = make_loader([data], scale=2, needs=method.needs, batch=4, crop=16, cache=data.parent / "cache")
+    shared = {"scale": 2, "needs": method.needs, "window": method.window, "cache": data.parent / "cache"}
+    loader = make_loader([data], batch=4, crop=16, **shared)
     batches = [next(loader) for _ in range(3)]
     loader.close()
     losses, nets = [], []

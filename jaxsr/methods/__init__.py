@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxsr.errors import JaxsrError
-from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, taau
+from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, rcan, rrn, taau
 from jaxsr.methods._method import Method
 
 
@@ -16,7 +16,11 @@ class Learned(NamedTuple):
     method: Callable[[Any], Method]
 
 
-LEARNED: dict[str, Learned] = {"fusion-sr": Learned(fusion_sr.Options, fusion_sr.method)}
+LEARNED: dict[str, Learned] = {
+    "fusion-sr": Learned(fusion_sr.Options, fusion_sr.method),
+    "rcan": Learned(rcan.Options, rcan.method),
+    "rrn": Learned(rrn.Options, rrn.method),
+}
 
 METHODS: dict[str, Method] = {
     made.name: made

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
-from typing import Any
+from typing import Annotated, Any
 
 import tyro
 
@@ -41,6 +41,10 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
             fix="name it before the options",
         )
     options = learned[name].options
+    for_one_scale = any(field.name == "scale" for field in dataclasses.fields(options))
+    if for_one_scale:  # that of the training: one option, not two
+        hidden = [("scale", Annotated[int, tyro.conf.Suppress], 1)]
+        options = dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
     both = dataclasses.make_dataclass(
         "both", [("training", TrainConfig, TrainConfig()), ("method", options, options())]
     )
@@ -51,6 +55,9 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
         description=DESCRIPTION,
         config=(tyro.conf.OmitArgPrefixes,),
     )
-    config, method = chosen.training, learned[name].method(chosen.method)
+    config, chosen_options = chosen.training, chosen.method
+    if for_one_scale:
+        chosen_options = dataclasses.replace(chosen_options, scale=config.scale)
+    method = learned[name].method(chosen_options)
     weights = train(method, config)
     print(f"{weights}: use it with `jaxsr upscale SEQ --method {weights} --scale {config.scale}`")

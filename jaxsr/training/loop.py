@@ -73,7 +73,7 @@ def train(
         KeyboardInterrupt: on Ctrl-C (or SIGTERM), after the step and a checkpoint; on the second at once.
     """
     config.check()
-    _check_method(method)
+    _check_method(method, config)
     whole, parts = shardings(config.batch, devices)
     weights: Net = None
     notes: list[str] = []
@@ -189,10 +189,17 @@ def train(
     return file
 
 
-def _check_method(method: Method) -> None:
+def _check_method(method: Method, config: TrainConfig) -> None:
     """Say at once what would else come up when the step is compiled, after the data were converted."""
     if method.new_net is None or method.loss is None:
         raise JaxsrError(f"method {method.name!r} learns nothing", expected="a method with a network")
+    if (scale := method.arguments.get("scale", config.scale)) != config.scale:
+        raise JaxsrError(
+            f"the network of {method.name!r} is made for another scale",
+            where="--scale",
+            expected=scale,
+            found=config.scale,
+        )
     if method.arguments.get("perceptual_weight") and not perceptual.installed():
         raise JaxsrError(
             "the loss has LPIPS in it, whose weights are the extra `perceptual`, which is not installed",
