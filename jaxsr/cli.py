@@ -283,8 +283,8 @@ def render(
 def convert_weights(
     source: Positional[Path],
     out: Positional[Path],
-    method: str = "fusion-sr",
-    scale: int = 4,
+    method: str | None = None,
+    scale: int | None = None,
     buffers: tuple[str, ...] = (),
     half: bool = False,
 ) -> None:
@@ -293,15 +293,16 @@ def convert_weights(
     Args:
         source: the published file.
         out: the file to write, ending in .safetensors.
-        method: that the weights are for; which variant of it follows from their shapes.
-        scale: that they were trained for.
-        buffers: the network's G-buffer channels, in order, where it has not all of them in the paper's order.
+        method: that the weights are for, fusion-sr, rcan or rrn; by default their names tell which.
+        scale: that they were trained for; 4, where their shapes do not tell.
+        buffers: fusion-sr's G-buffer channels, in order, where it has not all of them in the paper's order.
         half: store float16.
     """
     from jaxsr.convert import convert_published
 
-    arguments = convert_published(source, out, method, scale=scale, buffers=buffers or None, half=half)
-    print(f"{out}: {method}, " + ", ".join(f"{name} {value}" for name, value in arguments.items()))
+    header = convert_published(source, out, method, scale=scale, buffers=buffers or None, half=half)
+    told = ", ".join(f"{name} {value}" for name, value in header["arguments"].items())
+    print(f"{out}: {header['method']}, {told}")
 
 
 @app.command(name="train")

@@ -12,15 +12,18 @@ from jaxsr.errors import JaxsrError
 from jaxsr.io.published import read_published
 from jaxsr.io.weights import into, save_weights
 from jaxsr.methods import build
-from jaxsr.nets.published import PUBLISHED, translate
+from jaxsr.nets.published import PUBLISHED, method_of, translate
+
+SCALE = 4
+"""Where neither the shapes nor the caller tell."""
 
 
 def convert_published(
     source: Path,
     out: Path,
-    method: str = "fusion-sr",
+    method: str | None = None,
     *,
-    scale: int = 4,
+    scale: int | None = None,
     buffers: Sequence[str] | None = None,
     half: bool = False,
 ) -> dict[str, Any]:
@@ -29,18 +32,19 @@ def convert_published(
     Args:
         source: `.pth`, `.npz` or `.safetensors`; nothing in it is executed.
         out: ends in `.safetensors`; replaced if it exists.
-        method: that the weights are for; the variant of its network is read off their shapes.
-        scale: that they were trained for; the shapes do not tell.
+        method: that the weights are for; by default the names of the arrays tell. The variant of its network
+            is read off their shapes.
+        scale: that they were trained for, 4 by default; not needed where the shapes tell.
         buffers: the G-buffer channels in the order of training, where they are not all in the paper's order.
         half: store float16.
 
     Returns:
-        The method's arguments, as the header records them.
+        The header of the file: "method", its "arguments", and more.
 
     Raises:
         JaxsrError: no such method, a file that cannot be read, or weights that do not fit the method.
     """
-    if method not in PUBLISHED:
+    if method is not None and method not in PUBLISHED:
         raise JaxsrError(
             f"no published weights of {method!r} are known",
             where="--method",
@@ -49,7 +53,11 @@ def convert_published(
     if out.suffix != ".safetensors":
         raise JaxsrError("bad name for a file of weights", where=out, expected="it to end in .safetensors")
     published = read_published(source)
+    method = method or method_of(published, source)
     arguments = PUBLISHED[method].arguments(published, buffers, source)
+    told = arguments.get("scale", scale or SCALE)
+    if scale not in (None, told):
+        raise JaxsrError("the weights are of another scale", where=source, expected=scale, found=told)
     new_net = build(method, arguments).new_net
     assert new_net is not None  # `build` knows only methods that learn
     net = nnx.eval_shape(lambda: new_net(nnx.Rngs(0)))
@@ -57,9 +65,9 @@ def convert_published(
     header = {
         "method": method,
         "arguments": arguments,
-        "scale": scale,
+        "scale": told,
         "jaxsr": jaxsr.__version__,
         "source": {"file": source.name, "sha256": hashlib.sha256(source.read_bytes()).hexdigest()},
     }
     save_weights(out, state, header, half=half)
-    return arguments
+    return header

@@ -16,12 +16,14 @@ from safetensors.numpy import save_file
 import jaxsr
 from jaxsr.convert import convert_published
 from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.run import find_method
 from jaxsr.io.published import read_published
 from jaxsr.io.weights import flatten, into, load_weights, save_weights
 from jaxsr.methods import build
-from jaxsr.nets import FusionSR, UNetSR
+from jaxsr.nets import RCAN, RRN, FusionSR, UNetSR
 from jaxsr.nets.fusion_sr import Fusion
 from jaxsr.nets.published import PUBLISHED
+from jaxsr.nets.rcan import MEAN
 from tests.networks import drawn
 from tests.reference import golden_fusion_sr
 from tests.test_cli import error_line, run
@@ -161,18 +163,33 @@ def published(method, net, seed=0):
     layers = {".".join(map(str, path)): module for path, module in nnx.iter_modules(net)}
     leaves = {"kernel": "weight", "scale": "weight", "mean": "running_mean", "var": "running_var"}
     rng, result = np.random.default_rng(seed), {}
+
+    def put(array, ours, theirs, leaf):
+        if not isinstance(theirs, str):  # one of ours is many of theirs
+            for part, name in zip(array, theirs, strict=True):
+                put(part, ours, name, leaf)
+            return
+        if array.ndim == 2 and method == "rcan":  # 1x1 convolutions
+            array = array[None, None]
+        if array.ndim == 4:
+            is_up = isinstance(layers[ours], nnx.ConvTranspose)
+            array = array.transpose(2, 3, 0, 1) if is_up else array.transpose(3, 2, 0, 1)
+        result[f"{theirs}.{leaves.get(leaf, leaf)}"] = np.ascontiguousarray(
+            array.T if array.ndim == 2 else array
+        )
+
     for ours, theirs in PUBLISHED[method].layers(net):
         for (leaf,), variable in nnx.to_flat_state(nnx.state(layers[ours])):
-            array = rng.random(variable.get_value().shape, np.float32)
-            if array.ndim == 4:
-                is_up = isinstance(layers[ours], nnx.ConvTranspose)
-                array = array.transpose(2, 3, 0, 1) if is_up else array.transpose(3, 2, 0, 1)
-            result[f"{theirs}.{leaves.get(leaf, leaf)}"] = np.ascontiguousarray(
-                array.T if array.ndim == 2 else array
-            )
+            put(rng.random(variable.get_value().shape, np.float32), ours, theirs, leaf)
         if ".norm" in ours:
             result[f"{theirs}.num_batches_tracked"] = np.array(7.0, np.float32)
-    return result
+    return result | (mean_shifts(1) if method == "rcan" else {})
+
+
+def mean_shifts(span):
+    """RCAN's, for colours of this range."""
+    mean, eye = np.array(MEAN, np.float32) * span, np.eye(3, dtype=np.float32)[..., None, None]
+    return {"sub_mean.weight": eye, "sub_mean.bias": -mean, "add_mean.weight": eye, "add_mean.bias": mean}
 
 
 @functools.cache
@@ -196,7 +213,7 @@ def test_the_header_of_published_weights_builds_their_network(tmp_path, make, ar
     np.savez(source, **published("fusion-sr", abstract(make, **arguments)))
     told = convert_published(source, out, buffers=arguments.get("buffers"), scale=2)
     arrays, header = load_weights(out)
-    assert header["arguments"] == json.loads(json.dumps(told))
+    assert header == json.loads(json.dumps(told))
     assert (header["method"], header["scale"], header["jaxsr"]) == ("fusion-sr", 2, jaxsr.__version__)
     assert header["source"]["file"] == "a.npz"
     assert {k: header["arguments"][k] for k in ("color", "start", "follow_jitter")} == {
@@ -212,8 +229,82 @@ def test_the_header_of_published_weights_builds_their_network(tmp_path, make, ar
         assert method.arguments[key] == value
 
 
-def converted_output(source, out, *inputs):
-    """What our network makes of published weights, by way of `jaxsr convert-weights`."""
+@pytest.mark.parametrize(
+    ("make", "method", "arguments"),
+    [
+        (RCAN, "rcan", {"scale": 4, "groups": 2, "blocks": 3, "features": 8, "reduction": 2}),
+        (RCAN, "rcan", {"scale": 3, "groups": 1, "blocks": 1, "features": 6, "reduction": 6}),
+        (RCAN, "rcan", {"scale": 2, "groups": 11, "blocks": 1, "features": 4, "reduction": 4}),
+        (RRN, "rrn", {"scale": 4, "blocks": 2, "features": 8}),
+        (RRN, "rrn", {"scale": 2, "blocks": 12, "features": 4}),
+    ],
+)
+def test_names_and_shapes_of_published_weights_tell_all(tmp_path, capsys, make, method, arguments):
+    source, out = tmp_path / "a.npz", tmp_path / "a.safetensors"
+    np.savez(source, **published(method, abstract(make, **arguments)))
+    status, told, _ = run(capsys, "convert-weights", source, out)
+    assert status == 0
+    assert f"{method}, scale {arguments['scale']}" in told
+    arrays, header = load_weights(out)
+    assert (header["method"], header["arguments"], header["scale"]) == (
+        method,
+        arguments,
+        arguments["scale"],
+    )
+    into(nnx.state(abstract(make, **arguments)), arrays, out)
+    assert find_method(str(out), arguments["scale"]).method.arguments["features"] == arguments["features"]
+    line = error_line(capsys, "convert-weights", source, out, "--scale", 7)
+    assert f"a.npz: the weights are of another scale; expected 7; found {arguments['scale']}" in line
+    line = error_line(capsys, "convert-weights", source, out, "--buffers", "depth")
+    assert "the network sees no G-buffer" in line
+    line = error_line(capsys, "convert-weights", source, out, "--method", "fusion-sr")
+    assert "not weights of a published fusion-sr network" in line
+
+
+def test_the_range_of_colours_of_a_published_rcan_does_not_matter(tmp_path):
+    """The official weights are for colours up to 255: the same network in other units."""
+    sizes = {"scale": 2, "groups": 1, "blocks": 2, "features": 4, "reduction": 2}
+    arrays = published("rcan", abstract(RCAN, **sizes))
+    other = arrays | mean_shifts(255) | {"head.0.weight": arrays["head.0.weight"] / 255}
+    other |= {name: arrays[name] * 255 for name in ("tail.1.weight", "tail.1.bias")}
+    converted = []
+    for name, content in (("unit", arrays), ("bytes", other)):
+        np.savez(tmp_path / f"{name}.npz", **content)
+        convert_published(tmp_path / f"{name}.npz", tmp_path / f"{name}.safetensors")
+        converted.append(load_weights(tmp_path / f"{name}.safetensors")[0])
+    for name, array in converted[0].items():
+        np.testing.assert_allclose(converted[1][name], array, rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.pop("sub_mean.bias"), r"a.npz: sub_mean is not RCAN's; .* found no such array"),
+        (lambda a: a.update({"add_mean.bias": np.array([0.5, 0.5, 0.5])}), r"add_mean is .*found \[0.5, 0.5"),
+        (lambda a: a.update({"add_mean.bias": np.zeros(7)}), "add_mean is not RCAN's"),
+        (lambda a: a.update({"sub_mean.weight": np.zeros((3, 3, 1, 1))}), "sub_mean is not RCAN's"),
+        (lambda a: a.pop("tail.1.bias"), "tail.1.bias is missing"),
+        (lambda a: a.pop("tail.0.0.weight"), r"bad scale; expected 2 \| 3 \| 4 \| 8; found 1"),
+        (lambda a: a.pop("body.0.body.1.body.2.bias"), "body.0.body.1.body.2.bias is missing"),
+        (
+            lambda a: a.update({"body.0.body.0.body.3.conv_du.2.weight": np.zeros((4, 2, 3, 3))}),
+            "arrays of several shapes for groups.blocks.attention.excite.kernel",
+        ),
+        (lambda a: a.update({"head.0.weight": np.zeros(4)}), "not weights of a published rcan network"),
+    ],
+)
+def test_published_rcans_that_do_not_fit_are_named(tmp_path, capsys, change, words):
+    sizes = {"scale": 2, "groups": 1, "blocks": 2, "features": 4, "reduction": 2}
+    arrays = published("rcan", abstract(RCAN, **sizes))
+    change(arrays)
+    np.savez(tmp_path / "a.npz", **arrays)
+    line = error_line(capsys, "convert-weights", tmp_path / "a.npz", tmp_path / "out.safetensors")
+    with pytest.raises(JaxsrError, match=words):
+        raise JaxsrError(line)
+
+
+def converted(source, out):
+    """Our network with published weights, by way of `jaxsr convert-weights`: compiled, and its state."""
     convert_published(source, out)
     arrays, header = load_weights(out)
     new_net = build(header["method"], header["arguments"]).new_net
@@ -221,18 +312,47 @@ def converted_output(source, out, *inputs):
     net = nnx.merge(graph, into(state, arrays, out))
     net.eval()
     graph, state = nnx.split(net)
-    return jax.jit(lambda state, *inputs: nnx.merge(graph, state)(*inputs))(state, *inputs)
+    return jax.jit(lambda state, *inputs: nnx.merge(graph, state)(*inputs)), state
 
 
-@pytest.mark.parametrize("name", ["fusion_sr", "unet_sr"])
-def test_converted_weights_give_the_published_output(tmp_path, name):
+def converted_output(source, out, *inputs):
+    run, state = converted(source, out)
+    return run(state, *inputs)
+
+
+def golden_of(name):
     if not (source := GOLDENS / f"{name}.npz").is_file():
         pytest.skip("the goldens of the published networks are not here")
-    golden = np.load(source)
-    inputs = (np.moveaxis(golden[f"in/{k}"], 1, -1) for k in ("color", "gbuffer"))
-    made = converted_output(source, tmp_path / "converted.safetensors", *inputs)
+    return source, np.load(source)
+
+
+@pytest.mark.parametrize(
+    ("name", "inputs"),
+    [
+        ("fusion_sr", ("color", "gbuffer")),
+        ("unet_sr", ("color", "gbuffer")),
+        ("rcan_g2b2c32", ("x",)),
+    ],
+)
+def test_converted_weights_give_the_published_output(tmp_path, name, inputs):
+    source, golden = golden_of(name)
+    images = (np.moveaxis(golden[f"in/{k}"], 1, -1) for k in inputs)
+    made = converted_output(source, tmp_path / "converted.safetensors", *images)
     expected = np.moveaxis(golden["out/y"], 1, -1)
     np.testing.assert_allclose(made, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def test_a_converted_rrn_gives_the_published_outputs(tmp_path):
+    """Three steps; of four frames the first only precedes the second."""
+    source, golden = golden_of("rrn_c32b2")
+    frames = np.moveaxis(golden["in/sequence"], (2, 1), (0, -1))
+    expected, last = np.moveaxis(golden["out/y"], (1, 2), (0, -1)), np.moveaxis(golden["out/h"], 1, -1)
+    run, state = converted(source, tmp_path / "converted.safetensors")
+    hidden, made = jnp.zeros(last.shape, jnp.float32), jnp.zeros(expected[0].shape, jnp.float32)
+    for t in range(3):
+        made, hidden = run(state, frames[t], frames[t + 1], hidden, made)
+        np.testing.assert_allclose(made, expected[t], atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(hidden, last, atol=1e-4 * np.abs(last).max())
 
 
 def test_converted_weights_give_the_output_of_pytorch(tmp_path):
@@ -430,7 +550,7 @@ FOUR = {"0": np.ones(4, np.float32).tobytes()}
         ("a.safetensors", lambda p: p.write_bytes(b"x"), "expected a whole safetensors file"),
         ("a.safetensors", lambda p: save_weights(p, {}, HEADER), "weights of jaxsr already"),
         ("a.onnx", lambda p: p.write_bytes(b"x"), "unknown kind of weights; expected .pth, .pt, .npz"),
-        ("a.npz", lambda p: np.savez(p, a=np.zeros(2)), "not weights of a published fusion-sr network"),
+        ("a.npz", lambda p: np.savez(p, a=np.zeros(2)), "not weights of a published network that is known"),
         ("a.npz", lambda p: np.savez(p), "no weights in the file"),
         ("a.pth", lambda p: None, "no such file"),
     ],
