@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxsr.errors import JaxsrError
-from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, taau
+from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, nsrr, taau
 from jaxsr.methods._method import Method
 
 
@@ -16,7 +16,10 @@ class Learned(NamedTuple):
     method: Callable[[Any], Method]
 
 
-LEARNED: dict[str, Learned] = {"fusion-sr": Learned(fusion_sr.Options, fusion_sr.method)}
+LEARNED: dict[str, Learned] = {
+    "fusion-sr": Learned(fusion_sr.Options, fusion_sr.method),
+    "nsrr": Learned(nsrr.Options, nsrr.method),
+}
 
 METHODS: dict[str, Method] = {
     made.name: made
