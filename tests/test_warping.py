@@ -9,8 +9,15 @@ from hypothesis import strategies as st
 from jax.test_util import check_grads
 
 from jaxsr import ops
+from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
-from jaxsr.ops.warping import backward_warp, forward_splat, occlusion_motion
+from jaxsr.ops.warping import (
+    backward_warp,
+    compose_motion,
+    forward_splat,
+    occlusion_motion,
+    warp_zero_upsampled,
+)
 from tests.reference import golden_warping
 from tests.reference import warping as reference
 from tests.transforms import assert_jit_and_batch
@@ -58,6 +65,30 @@ def test_splat_and_occlusion_motion_are_the_loops(size, seed):
     np.testing.assert_array_equal(splatted, values.astype(np.float32))
     np.testing.assert_array_equal(landed, mask)
     np.testing.assert_array_equal(occlusion_motion(motion, depth), reference.occlusion_motion(motion, depth))
+
+
+@given(
+    size=st.sampled_from(SIZES),
+    scale=st.sampled_from([1, 2, 3]),
+    seed=st.integers(0, 10**6),
+    data=st.data(),
+)
+def test_warp_of_zero_upsampled_samples_is_the_loop(size, scale, seed, data):
+    image, motion = _image(seed, *size, 2), _motion(seed, *(scale * n for n in size))
+    offset = data.draw(st.tuples(*2 * [st.integers(0, scale - 1)]))
+    result = warp_zero_upsampled(image, motion, scale, jnp.array(offset, jnp.int32))
+    expected = reference.warp_zero_upsampled(image, motion, scale, offset)
+    np.testing.assert_allclose(result, expected, atol=2e-6)
+    if offset == (0, 0):
+        np.testing.assert_array_equal(warp_zero_upsampled(image, motion, scale), result)
+
+
+@given(size=st.sampled_from(SIZES), seed=st.integers(0, 10**6))
+def test_composed_motion_is_the_loop(size, seed):
+    motion, before = _motion(seed, *size), [_motion(seed + k, *size) for k in (1, 2)]
+    result = compose_motion(motion, np.concatenate(before, -1))
+    expected = np.concatenate([reference.compose_motion(motion, b) for b in before], -1)
+    np.testing.assert_allclose(result, expected, rtol=1e-6, atol=1e-5)
 
 
 @pytest.mark.parametrize("library", ["opencv", "pytorch"])
@@ -184,6 +215,85 @@ def test_gradients_are_finite_differences(mode, boundary):
     )
 
 
+@pytest.mark.parametrize("scale", [1, 2, 3])
+def test_gradients_of_zero_upsampled_samples_are_those_of_the_plain_warp(scale):
+    image, motion = _image(13, 4, 3, 2), _motion(13, 4 * scale, 3 * scale)  # whole and half motion are in
+    offset = jnp.array([scale - 1, 0], jnp.int32)
+    cotangent = _image(14, *motion.shape[:2], 2)
+
+    def plain(image, motion):
+        return backward_warp(ops.zero_upsample(image, scale, offset), motion, boundary="zero")
+
+    found, expected = (
+        jax.grad(lambda i, m, warp=warp: (warp(i, m) * cotangent).sum(), (0, 1))(image, motion)
+        for warp in (lambda i, m: warp_zero_upsampled(i, m, scale, offset), plain)
+    )
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(a, b, atol=1e-5)
+
+
+def test_zero_upsampled_samples_are_shifted_with_what_they_hold():
+    image = np.float32([[np.inf, 2], [np.nan, 4]])[..., None]
+    still = np.zeros((4, 4, 2), np.float32)
+    offset = jnp.array([1, 0], jnp.int32)
+    spread = ops.zero_upsample(image, 2, offset)
+    np.testing.assert_array_equal(warp_zero_upsampled(image, still, 2, offset), spread)
+    shifted = warp_zero_upsampled(image, still + np.float32([1, -2]), 2, offset)
+    np.testing.assert_array_equal(shifted[:-2, 1:], spread[2:, :-1])
+    np.testing.assert_array_equal(warp_zero_upsampled(image, still + np.inf, 2, offset), 0)
+    np.testing.assert_array_equal(warp_zero_upsampled(image, still * np.nan, 2, offset), spread)
+
+
+def test_composed_gradients_are_finite_differences():
+    rng = np.random.default_rng(15)
+    motion, before = (
+        (rng.integers(-5, 6, (6, 4, c)) + rng.uniform(0.2, 0.8, (6, 4, c))).astype(np.float32) for c in (2, 4)
+    )
+    check_grads(
+        compose_motion, (motion, before), order=1, modes=["fwd", "rev"], atol=2e-2, rtol=2e-2, eps=1e-2
+    )
+
+
+def test_composed_unknown_and_infinite_motion_stay_numbers():
+    motion, before = _motion(16, 6, 4), _motion(17, 6, 4)
+    motion[0, 0], motion[1, 1], motion[2, 2] = np.nan, np.inf, -np.inf
+    before[3, 3], before[4, 1], before[5, 2] = np.nan, np.inf, -np.inf
+    composed = before
+    for _ in range(5):
+        composed = compose_motion(motion, composed)
+        assert np.isfinite(composed).all()
+    assert np.all(composed[1, 1] > 9e5)
+    np.testing.assert_array_equal(composed[0, 0], before[0, 0])  # unknown counts as none, five times
+    gradients = jax.grad(lambda m, b: compose_motion(m, b).sum(), (0, 1))(motion, before)
+    assert all(np.isfinite(g).all() for g in gradients)
+
+
+def test_composed_uniform_motion_adds_up():
+    first, second = (np.broadcast_to(np.float32(m), (5, 7, 2)) for m in ([0.25, -3], [1.5, 0.5]))
+    np.testing.assert_allclose(compose_motion(first, second), first + second, atol=1e-6)
+    np.testing.assert_array_equal(compose_motion(first, np.zeros_like(first)), first)
+
+
+def test_composed_motion_leads_to_the_same_point():
+    """Three frames back in the analytic scene: what does not move has the position there that it has here."""
+    size = (96, 64)
+    layers = [analytic.render(t, size) for t in range(4)]
+    path, seen = np.zeros_like(layers[0]["motion"]), np.ones((64, 96, 1), np.float32)
+    for now in layers[1:]:
+        path = compose_motion(now["motion"], path)
+        seen = now["visible_before"] * backward_warp(seen, now["motion"], mode="nearest")
+    there = backward_warp(layers[0]["position"], path)
+    ids = backward_warp(layers[0]["object_id"], path)
+    still = np.isin(layers[3]["object_id"], (1, 2, 4)) & (ids == layers[3]["object_id"]) & (seen == 1)
+    assert still.mean() > 0.5
+    off = np.linalg.norm(there - layers[3]["position"], axis=-1, keepdims=True) / layers[3]["depth"]
+    pixel = 2 * 0.62 / size[0]
+    assert np.quantile(off[still], 0.5) < 0.02 * pixel
+    assert np.quantile(off[still], 0.95) < 0.5 * pixel
+    moved = np.linalg.norm(path, axis=-1, keepdims=True)[still]
+    assert np.median(moved) > 2
+
+
 def test_splat_gradient_goes_to_the_winners():
     motion, depth = _scene(7, 6, 4)
     values = _image(7, 6, 4, 2)
@@ -240,6 +350,11 @@ def test_jit_and_batch():
         assert_jit_and_batch(lambda i, m, mode=mode: backward_warp(i, m, mode=mode), image, motion)
     assert_jit_and_batch(forward_splat, image, motion, depth)
     assert_jit_and_batch(occlusion_motion, motion, depth)
+    assert_jit_and_batch(compose_motion, motion, image)
+    offsets = np.array([[0, 1], [2, 0]], np.int32)
+    assert_jit_and_batch(
+        lambda i, m, o: warp_zero_upsampled(i, m, 3, o), image[:, ::3, :1], motion[:, :, :3], offsets
+    )
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -259,6 +374,12 @@ def test_bad_arguments():
         backward_warp(image, motion, boundary="wrap")
     with pytest.raises(JaxsrError, match="image sizes differ"):
         forward_splat.__wrapped__.__wrapped__(image, motion[:-1], motion[..., :1])
+    with pytest.raises(JaxsrError, match="scale: bad scale"):
+        warp_zero_upsampled(image, motion, 0)
+    with pytest.raises(JaxsrError, match=r"expected motion_px \[.., 8, 10, 2\]; found \[4, 5, 2\]"):
+        warp_zero_upsampled(image, motion, 2)
+    with pytest.raises(JaxsrError, match="expected pairs of channels"):
+        compose_motion(motion, image[..., :1])
 
 
 def test_motion_has_two_channels():

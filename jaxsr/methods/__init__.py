@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxsr.errors import JaxsrError
-from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, rcan, rrn, taau
+from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, nsrr, rcan, rrn, taau
 from jaxsr.methods._method import Method
 
 
@@ -20,6 +20,7 @@ LEARNED: dict[str, Learned] = {
     "fusion-sr": Learned(fusion_sr.Options, fusion_sr.method),
     "rcan": Learned(rcan.Options, rcan.method),
     "rrn": Learned(rrn.Options, rrn.method),
+    "nsrr": Learned(nsrr.Options, nsrr.method),
 }
 
 METHODS: dict[str, Method] = {

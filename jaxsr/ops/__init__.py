@@ -48,13 +48,20 @@ from jaxsr.ops.resampling import (
     upsample,
     zero_upsample,
 )
-from jaxsr.ops.warping import backward_warp, forward_splat, occlusion_motion
+from jaxsr.ops.warping import (
+    backward_warp,
+    compose_motion,
+    forward_splat,
+    occlusion_motion,
+    warp_zero_upsampled,
+)
 
 __all__ = [
     "SamplePositions",
     "backward_warp",
     "blend_mask",
     "camera_motion",
+    "compose_motion",
     "current_positions",
     "demodulate",
     "demodulation_divisor",
@@ -90,6 +97,7 @@ __all__ = [
     "unjittered_motion",
     "upsample",
     "view_directions",
+    "warp_zero_upsampled",
     "world_position",
     "ycocg_from_rgb",
     "zero_upsample",

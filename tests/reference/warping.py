@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from tests.reference.resampling import kernel
+from tests.reference.resampling import kernel, zero_upsample
 
 
 def backward_warp(image: np.ndarray, motion: np.ndarray, mode: str, boundary: str) -> np.ndarray:
@@ -24,6 +24,24 @@ def backward_warp(image: np.ndarray, motion: np.ndarray, mode: str, boundary: st
             inside = 0 <= tx < width and 0 <= ty < height
             if inside or boundary == "clamp":
                 out[y, x] += weight * image[min(max(ty, 0), height - 1), min(max(tx, 0), width - 1)]
+    return out
+
+
+def warp_zero_upsampled(image: np.ndarray, motion: np.ndarray, scale: int, offset=(0, 0)) -> np.ndarray:
+    return backward_warp(zero_upsample(image, scale, offset), motion, "bilinear", "zero")
+
+
+def compose_motion(motion: np.ndarray, before: np.ndarray) -> np.ndarray:
+    """`before` has one pair of channels."""
+    height, width, _ = motion.shape
+    out = np.zeros(motion.shape)
+    for y, x in np.ndindex(height, width):
+        px, py = x - float(motion[y, x, 0]), y - float(motion[y, x, 1])
+        out[y, x] = motion[y, x]
+        for ty in range(int(np.floor(py)), int(np.floor(py)) + 2):
+            for tx in range(int(np.floor(px)), int(np.floor(px)) + 2):
+                weight = max(0, 1 - abs(tx - px)) * max(0, 1 - abs(ty - py))
+                out[y, x] += weight * before[min(max(ty, 0), height - 1), min(max(tx, 0), width - 1)]
     return out
 
 
