@@ -26,7 +26,7 @@ from jaxsr.training import TrainConfig, loop
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
 from jaxsr.training.record import Bar, Log, plot_curve
-from jaxsr.training.state import begin, inference_net, optimizer, schedule
+from jaxsr.training.state import begin, optimizer, schedule
 from jaxsr.training.step import averaged, make_step, shardings
 from tests import tiny_method
 from tests.builders import make_sequence
