@@ -1,0 +1,59 @@
+"""A method of your own, trained and compared: two convolutions over bicubic colour and the HR G-buffer.
+
+python experiments/examples/add_a_method.py [--steps 150] [--out example]
+"""
+
+from dataclasses import make_dataclass
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import tyro
+from flax import nnx
+
+from jaxsr.evaluation.evaluate import evaluate
+from jaxsr.evaluation.progress import bars
+from jaxsr.evaluation.sample import unpack_sample
+from jaxsr.evaluation.upscale import Settings
+from jaxsr.methods import LEARNED, Learned, Method
+from jaxsr.ops import from_display, sample_jittered, to_display
+from jaxsr.training import TrainConfig, train
+
+
+class Net(nnx.Module):
+    def __init__(self, rngs: nnx.Rngs):
+        self.conv1 = nnx.Conv(9, 16, (3, 3), rngs=rngs)
+        self.conv2 = nnx.Conv(16, 3, (3, 3), rngs=rngs)
+
+    def __call__(self, frame):  # a `jaxsr.frames.Frame`; makes display-referred colour
+        hr, color = frame.hr, to_display(frame.color_linear, frame.exposure)
+        color = sample_jittered(color, frame.jitter_px, hr.normal.shape[:2], "bicubic")
+        x = nnx.relu(self.conv1(jnp.concatenate([color, hr.base_color, hr.normal], -1)))
+        return color + self.conv2(x)
+
+
+def loss(net, window):  # of a batch of windows; here their last frames are all there is
+    frames, truth = jax.tree.map(lambda x: x[:, -1], window)
+    return jnp.mean(jnp.abs(jax.vmap(net)(frames) - jax.vmap(to_display)(truth, frames.exposure))), {}
+
+
+def step(net, state, frame):  # one frame; `state` is what goes from frame to frame: nothing here
+    module = nnx.merge(nnx.graphdef(nnx.eval_shape(lambda: Net(nnx.Rngs(0)))), net)
+    return state, from_display(jnp.clip(module(frame), 0, 1)) / frame.exposure
+
+
+NEEDS = frozenset({"lr.color", "hr.base_color", "hr.normal"})
+MINE = Method("mine", "two convolutions", lambda frame: (), step, NEEDS, Net, loss)
+LEARNED["mine"] = Learned(make_dataclass("Options", []), lambda _: MINE)  # how its weights find it
+
+
+def main(steps: int = 150, out: Path = Path("example")) -> None:
+    weights = train(MINE, TrainConfig(steps=steps, out=out / "mine"))
+    clips, methods = unpack_sample(out / "sample", "test"), ["taau", "fusion-sr", str(weights)]
+    with bars() as progress:
+        evaluate(clips, methods, out / "compared", Settings(4), progress=progress)
+    print((out / "compared" / "metrics.md").read_text())
+
+
+if __name__ == "__main__":
+    tyro.cli(main)

@@ -1,0 +1,241 @@
+"""Train every network of the fusion paper's tables on the same crops, and measure all on the same frames.
+
+    python experiments/fusion_sr/study.py [NAME ...] [--seeds 0 1] [--data DIR] [--runs DIR]
+
+Names are those of `VARIANTS`: networks, and methods that learn nothing. Each (name, seed) is trained, then
+measured on the test clips of the sample, and becomes a file `experiments/results/fusion_sr/NAME-sSEED.json`:
+configuration, learning curve, machine, commit, and every metric of every frame. What has such a file is not
+made again (`--again`), and a training goes on where it was stopped. `tables.py` turns the files into tables.
+
+The same for all: clips, order of the crops, flips, number of steps, schedule, clipping, loss (1 - SSIM + L1
+on display-referred colour), jitter, exposure, tone map. One network for all three scenes. Test frames: the
+last four of each clip; the four before them are shown to every method and not measured, so that history is
+full.
+"""
+
+import csv
+import dataclasses
+import json
+import sys
+import tempfile
+import time
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
+
+import tyro  # noqa: E402
+from tyro.conf import Positional  # noqa: E402
+
+from experiments.make_datasets import CACHE, Render, clips_of  # noqa: E402
+from experiments.provenance import commit  # noqa: E402
+from jaxsr.errors import JaxsrError  # noqa: E402
+from jaxsr.evaluation.demo import description  # noqa: E402
+from jaxsr.evaluation.measuring import Reference  # noqa: E402
+from jaxsr.evaluation.progress import bars  # noqa: E402
+from jaxsr.evaluation.run import Ready, find_method  # noqa: E402
+from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
+from jaxsr.evaluation.tables import json_value  # noqa: E402
+from jaxsr.evaluation.upscale import Settings, run_track  # noqa: E402
+from jaxsr.io.exr import atomic_path  # noqa: E402
+from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
+from jaxsr.methods import Method, build, fusion_sr  # noqa: E402
+from jaxsr.training.config import TrainConfig  # noqa: E402
+from jaxsr.training.loop import train  # noqa: E402
+
+RESULTS = ROOT / "experiments" / "results" / "fusion_sr"
+RUNS = ROOT / "experiments" / "cache" / "study"
+SCALE, WARM_UP = 4, 4
+CLIPS = 3
+"""Training clips of each scene, of the five that the training set has."""
+LOSS = {"ssim_weight": 1.0, "l1_weight": 1.0, "perceptual_weight": 0.0}
+PAPER = {"color": "display", "start": "nothing"}
+"""The picture from colour and G-buffer alone, as published; the default corrects a guided upsampling."""
+BUFFERS = fusion_sr.BUFFERS
+
+BUDGET = TrainConfig(
+    scale=SCALE, steps=800, batch=4, crop=96, schedule="cosine", clip_norm=1.0, eval_every=200, save_every=100
+)
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row or column of a table."""
+
+    label: str
+    method: str
+    arguments: dict[str, Any] | None = None
+    """Of the network; None for a method that learns nothing."""
+
+    def build(self) -> Method:
+        """The method with the loss of the study."""
+        assert self.arguments is not None
+        return build(self.method, LOSS | self.arguments)
+
+
+def without(*names: str) -> dict[str, Any]:
+    """The fusion network of the paper that does not see these buffers."""
+    return PAPER | {"buffers": tuple(name for name in BUFFERS if name not in names)}
+
+
+VARIANTS = {
+    "bicubic": Variant("bicubic", "bicubic"),
+    "taau": Variant("TAAU", "taau"),
+    "guided-taau": Variant("guided TAAU", "guided-taau"),
+    "rcan": Variant("RCAN 5x4x64", "rcan", {"groups": 5, "blocks": 4}),
+    "nsrr": Variant("NSRR", "nsrr", {}),
+    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64}),
+    "fusion": Variant("fusion", "fusion-sr", PAPER),
+    "fusion-guided": Variant("fusion, guided start", "fusion-sr", {}),
+    "concat": Variant("concat", "fusion-sr", PAPER | {"fusion": "concat"}),
+    "add": Variant("add", "fusion-sr", PAPER | {"fusion": "add"}),
+    "unet": Variant("single-branch U-Net", "fusion-sr", PAPER | {"architecture": "unet"}),
+    "depth-only": Variant("depth only", "fusion-sr", PAPER | {"buffers": ("depth",)}),
+    "no-base-color": Variant("no base colour", "fusion-sr", without("base_color")),
+    "no-normal": Variant("no normal", "fusion-sr", without("normal")),
+    "no-depth": Variant("no depth", "fusion-sr", without("depth")),
+    "no-roughness": Variant("no roughness", "fusion-sr", without("roughness")),
+    "no-metallic": Variant("no metallic", "fusion-sr", without("metallic")),
+}
+
+
+def chosen(names: tuple[str, ...]) -> dict[str, Variant]:
+    """The variants of these names, all by default.
+
+    Raises:
+        JaxsrError: there is no such variant.
+    """
+    if unknown := [name for name in names if name not in VARIANTS]:
+        raise JaxsrError(f"no variant {unknown[0]!r}", expected=", ".join(VARIANTS))
+    return {name: VARIANTS[name] for name in names or VARIANTS}
+
+
+def training_clips(data: Path) -> tuple[Path, ...]:
+    """The first clips of each scene of the training set.
+
+    Raises:
+        JaxsrError: one is missing.
+    """
+    folders = sorted(data / clip.name for clip in clips_of(Render("train", clips=CLIPS)))
+    for folder in folders:
+        if not (folder / "sequence.json").is_file():
+            raise JaxsrError(
+                "no training clip",
+                where=folder,
+                expected=f"{len(folders)} clips in {data}",
+                fix=f"python experiments/make_datasets.py render --set train --clips {CLIPS}, or --data",
+            )
+    return tuple(folders)
+
+
+def results_file(name: str, seed: int, results: Path = RESULTS) -> Path:
+    """Where the numbers of a run are; of what learns nothing there is one run."""
+    return results / (f"{name}.json" if VARIANTS[name].arguments is None else f"{name}-s{seed}.json")
+
+
+def log_of(run: Path) -> tuple[list[dict[str, float]], float]:
+    """Loss, and the metrics of the held-back frames, by step; and the seconds that the training took."""
+    with (run / "log.csv").open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    wanted = ("step", "loss", "eval/psnr", "eval/ssim")
+    curve = [{key: round(float(row[key]), 5) for key in wanted if row.get(key)} for row in rows]
+    return curve, float(rows[-1]["seconds"])
+
+
+def measure(ready: Ready, clips: list[Path], frames: Path) -> dict[str, Any]:
+    """Every metric of every measured frame, by scene; the frames that were made stay in `frames`."""
+    scenes, begun = {}, time.monotonic()
+    with bars() as progress:
+        sequences = [FrameSequence.open(clip) for clip in clips]
+        advance = progress("measure", 2 * sum(map(len, sequences)))
+        for sequence in sequences:
+            settings = Settings(SCALE, warmup=WARM_UP)
+            reference = Reference(sequence, in_regions=True)
+            track = run_track(sequence, ready, frames / sequence.name, settings, reference, advance)
+            assert track.cost is not None
+            scenes[sequence.name.split("-")[0]] = {
+                "sequence": sequence.name,
+                "frames": [info.index for info in sequence.infos[WARM_UP:]],
+                "metrics": track.metrics,
+                "regions": track.regions,
+            }
+    measured = description(commit=commit(), scale=SCALE, warm_up=WARM_UP)
+    measured["seconds"] = round(time.monotonic() - begun, 1)
+    return {"measured": measured, "cost": dataclasses.asdict(track.cost), "scenes": scenes}
+
+
+def run(name: str, seed: int, data: tuple[Path, ...], runs: Path, clips: list[Path]) -> dict[str, Any]:
+    """Train, measure, and say all that there is to say of it."""
+    variant, out = VARIANTS[name], runs / results_file(name, seed).stem
+    found: dict[str, Any] = {"name": name, "label": variant.label, "method": variant.method}
+    if variant.arguments is None:
+        ready = find_method(variant.method, SCALE)
+    else:
+        config, method = replace(BUDGET, seed=seed, data=data, out=out), variant.build()
+        ready = find_method(str(train(method, config)), SCALE)
+        record = json.loads((out / "config.json").read_text(encoding="utf-8"))
+        curve, seconds = log_of(out)
+        folders = ("data", "eval_data", "out", "cache", "init")
+        found |= {
+            "seed": seed,
+            "arguments": record["arguments"],
+            "config": {key: value for key, value in record["config"].items() if key not in folders},
+            "sequences": record["sequences"],
+            "trained": record["made"] | {"seconds": round(seconds, 1)},
+            "curve": curve,
+        }
+    return found | measure(ready, clips, out / "frames")
+
+
+def main(
+    names: Positional[tuple[str, ...]] = (),
+    seeds: tuple[int, ...] = (0, 1),
+    data: Path = CACHE / "train",
+    runs: Path = RUNS,
+    results: Path = RESULTS,
+    again: bool = False,
+) -> None:
+    """Train and measure these variants, all by default.
+
+    Args:
+        names: of the variants.
+        seeds: of the trainings.
+        data: folder of the training set.
+        runs: folder for the runs.
+        results: folder for the numbers.
+        again: make what has numbers already; trainings that have ended are only measured again.
+    """
+    todo = [
+        (name, seed)
+        for seed in seeds
+        for name, variant in chosen(names).items()
+        if (variant.arguments is not None or seed == seeds[0])
+        and (again or not results_file(name, seed, results).is_file())
+    ]
+    if not todo:
+        print(f"all is there; tables.py makes the tables of {results}")
+        return
+    learns = any(VARIANTS[name].arguments is not None for name, _ in todo)
+    folders = training_clips(data) if learns else ()
+    with tempfile.TemporaryDirectory() as folder:
+        clips = unpack_sample(Path(folder), "test", scale=SCALE)
+        for done, (name, seed) in enumerate(todo, 1):
+            file = results_file(name, seed, results)
+            print(f"{file.stem} ({done} of {len(todo)})")
+            found = run(name, seed, folders, runs, clips)
+            file.parent.mkdir(parents=True, exist_ok=True)
+            with atomic_path(file) as temporary:
+                temporary.write_text(json.dumps(json_value(found), indent=1) + "\n", encoding="utf-8")
+
+
+if __name__ == "__main__":
+    try:
+        tyro.cli(main, config=(tyro.conf.OmitArgPrefixes,))
+    except JaxsrError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise SystemExit(2) from None
+    except KeyboardInterrupt:
+        print("stopped; the same command goes on", file=sys.stderr)
+        raise SystemExit(130) from None

@@ -1,0 +1,207 @@
+"""The experiments of the fusion paper: what is trained, the tables, and the page with their numbers."""
+
+import importlib.util
+import json
+
+import jax
+import numpy as np
+import pytest
+from flax import nnx
+
+from experiments.fusion_sr import flicker, study, tables, timing
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.cost import count_parameters
+from jaxsr.evaluation.run import find_method, stream
+from jaxsr.methods import LEARNED
+from jaxsr.training import TrainConfig, train
+from tests.builders import make_sequence
+
+LEARNING = [name for name, variant in study.VARIANTS.items() if variant.arguments is not None]
+
+
+def made(name, seed=0, psnr=20.0, **changes):
+    """A file of `study.py`, all of whose frames have the same numbers."""
+    metrics = {"psnr": [psnr] * 4, "ssim": [0.5] * 4, "tpsnr": [None, psnr, psnr, psnr]}
+    scene = {"sequence": "s", "frames": [5, 6, 7, 8], "metrics": metrics, "regions": {"edges": metrics}}
+    found = {
+        "name": name,
+        "scenes": dict.fromkeys(tables.SCENES, scene),
+        "measured": {"display": "sRGB", "date": "2026-01-01"},
+        "cost": {"parameters": 7, "multiply_adds_per_px": 8.0},
+    }
+    if study.VARIANTS[name].arguments is not None:
+        config = {"steps": 3, "batch": 1, "crop": 8, "scale": 4, "learning_rate": 1e-3}
+        found |= {
+            "seed": seed,
+            "config": config | {"schedule": "cosine", "clip_norm": 1.0},
+            "sequences": ["clip hash"],
+            "trained": {"commit": "abc", "device": "cpu", "seconds": 3600},
+        }
+    return found | changes
+
+
+@pytest.mark.parametrize("name", LEARNING)
+def test_a_variant_is_the_network_that_its_label_says(name):
+    method = study.VARIANTS[name].build()
+    state = nnx.eval_shape(lambda: nnx.state(method.new_net(nnx.Rngs(0))))
+    count = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.filter_state(state, nnx.Param)))
+    expected = {
+        "nsrr": 547_767,
+        "fusion": 418_619,
+        "unet": 506_907,
+    }
+    assert count == expected.get(name, count) > 100_000
+    seen = {
+        word for word in ("depth", "base-color", "normal", "roughness", "metallic") if f"no-{word}" == name
+    }
+    if seen:
+        assert not {f"hr.{word.replace('-', '_')}" for word in seen} & method.needs
+    assert method.arguments["ssim_weight"] == method.arguments["l1_weight"] == 1
+    assert method.arguments["perceptual_weight"] == 0
+
+
+def test_names_are_checked_before_any_work(tmp_path):
+    with pytest.raises(JaxsrError, match=r"no variant 'rcam'.*expected bicubic"):
+        study.main(("rcam",), results=tmp_path)
+    with pytest.raises(JaxsrError, match=r"no table 'table9'.*expected table1"):
+        tables.main(("table9",))
+
+
+def test_an_incomplete_training_set_is_an_error(tmp_path):
+    with pytest.raises(JaxsrError, match=r"no training clip.*9 clips.*--clips 3"):
+        study.main(("fusion",), data=tmp_path, runs=tmp_path / "runs", results=tmp_path / "results")
+    assert not (tmp_path / "results").exists()
+
+
+def test_what_has_numbers_is_not_made_again(tmp_path, capsys):
+    study.results_file("taau", 0, tmp_path).write_text("{}")
+    study.main(("taau",), results=tmp_path)
+    assert "all is there" in capsys.readouterr().out
+    assert study.results_file("taau", 0, tmp_path).read_text() == "{}"
+
+
+def test_a_number_is_the_mean_over_frames_then_seeds():
+    runs = [made("fusion", 0, 20.0), made("fusion", 1, 21.0)]
+    assert tables.value(runs, "docks", "psnr") == (20.5, 0.5, 2)
+    assert tables.value(runs, "docks", "tpsnr", "edges") == (20.5, 0.5, 2)
+    assert tables.value(runs, "docks", "lpips") is None
+    assert tables.shown(tables.value(runs, "docks", "psnr"), "psnr") == "20.50 ± 0.50"
+    assert tables.shown(tables.value(runs[:1], "docks", "psnr"), "psnr") == "20.00"
+
+
+def test_a_table_has_the_papers_numbers_beside_ours():
+    runs = {name: [made(name)] for name in tables.TABLES["table5"].variants}
+    found = tables.document("table5", runs)
+    lines = tables.markdown(found)
+    assert "| docks | NSRR | 20.00 | 20.79 | 0.5000 | 0.7006 | 20.00 | 7 | 8 |" in lines
+    assert "3 steps of 1 crops of 8 px from 1 clips" in lines[-1]
+    assert "commit abc" in lines[-1]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"config": made("nsrr")["config"] | {"steps": 4}}, "budget and data"),
+        ({"sequences": ["other hash"]}, "training clips"),
+        ({"measured": {"display": "linear", "date": ""}}, "display"),
+    ],
+)
+def test_a_table_of_unequal_runs_is_an_error(changes, message):
+    runs = {name: [made(name)] for name in tables.TABLES["table5"].variants}
+    runs["nsrr"] = [made("nsrr", **changes)]
+    with pytest.raises(JaxsrError, match=message):
+        tables.document("table5", runs)
+
+
+def test_a_table_without_a_run_names_the_command():
+    with pytest.raises(JaxsrError, match=r"no numbers of depth-only, nsrr.*study.py depth-only nsrr"):
+        tables.document("table5", {"fusion": [made("fusion")]})
+
+
+def test_the_page_keeps_what_is_around_a_table():
+    page = "before\n<!-- t -->\nold\n<!-- end of t -->\nafter"
+    new = tables.on_page(page, "t", ["new"])
+    assert new == "before\n<!-- t -->\nnew\n<!-- end of t -->\nafter"
+    with pytest.raises(JaxsrError, match=r"no place for u.*<!-- u -->"):
+        tables.on_page(page, "u", [])
+
+
+def block(name):
+    """What the page has between the marks of a table."""
+    page = tables.PAGE.read_text(encoding="utf-8")
+    return page.partition(f"<!-- {name} -->\n")[2].partition(f"<!-- end of {name} -->")[0].splitlines()
+
+
+@pytest.mark.parametrize("name", tables.TABLES)
+def test_the_page_has_the_numbers_of_the_files(name):
+    if not (tables.RESULTS / f"{name}.json").is_file():
+        assert block(name) == ["Not measured yet."]
+        return
+    found = tables.document(name, tables.load())
+    assert json.loads((tables.RESULTS / f"{name}.json").read_text()) == json.loads(json.dumps(found))
+    lines = tables.markdown(found)
+    assert block(name)[: len(lines)] == lines
+
+
+@pytest.mark.parametrize("name", ["figure9", "runtime", "table2"])
+def test_the_page_has_the_numbers_of_flicker_and_timing(name):
+    files = {"figure9": "flicker", "runtime": "runtime", "table2": "render"}
+    file = tables.RESULTS / f"{files[name]}.json"
+    if not file.is_file():
+        assert block(name) == ["Not measured yet."]
+        return
+    found = json.loads(file.read_text())
+    if name == "figure9":
+        lines = flicker.table(found["errors"])
+    elif name == "runtime":
+        lines = timing.runtime_table(found["methods"], found["about"])
+    else:
+        runtime = json.loads((tables.RESULTS / "runtime.json").read_text())
+        lines = timing.render_table(found["seconds"], found["about"], runtime)
+    assert block(name)[: len(lines)] == lines
+
+
+def test_flicker_sees_colour_and_not_blur():
+    grey, tile = np.full((4, 48, 48, 3), 0.5), flicker.TILE
+    truths = grey.copy()
+    truths[1::2, :tile, : 2 * tile, 0] = 0.8  # a red lamp on two tiles, every second frame
+    lit = flicker.lit_tiles(truths)
+    assert lit.sum() == 2
+    assert lit[0, :2].all()
+    late = np.concatenate([truths[:1], truths[:-1]])
+    got = flicker.errors(late, truths, lit)
+    assert got[0] == 0
+    assert got[1] == pytest.approx(255 * 0.3 / np.sqrt(3), abs=1e-2)
+    sharper = truths + 0.1 * np.resize([1, -1], (48, 1))
+    assert flicker.errors(sharper, truths, lit) == pytest.approx([0] * 4, abs=1e-2)
+    with pytest.raises(JaxsrError, match="no lamp"):
+        flicker.lit_tiles(grey)
+
+
+def test_frames_that_are_not_there_name_the_command(tmp_path):
+    with pytest.raises(JaxsrError, match=r"no frames of nsrr.*expected 8 frames.*study.py nsrr"):
+        flicker.frames_of("nsrr", tmp_path, "bunker-test-0", 8)
+
+
+@pytest.fixture
+def example():
+    """The worked example; what it adds is taken away again."""
+    file = study.ROOT / "experiments" / "examples" / "add_a_method.py"
+    assert len(file.read_text().splitlines()) < 60
+    before = dict(LEARNED)
+    spec = importlib.util.spec_from_file_location("add_a_method", file)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    yield module
+    LEARNED.clear()
+    LEARNED.update(before)
+
+
+def test_the_worked_example_trains_and_runs(example, tmp_path):
+    sequence = make_sequence(tmp_path / "clip", frames=3, scales=(4,), size=(64, 48))
+    config = {"steps": 2, "batch": 2, "crop": 32, "out": tmp_path / "out", "cache": tmp_path / "cache"}
+    weights = train(example.MINE, TrainConfig(data=(tmp_path / "clip",), **config), quiet=True)
+    ready = find_method(str(weights), 4)
+    assert count_parameters(ready.net) == 9 * 9 * 16 + 16 + 9 * 16 * 3 + 3
+    images = [out.image for out in stream(ready.method, (sequence.frame(i, 4) for i in range(3)), ready.net)]
+    assert all(image.shape == (48, 64, 3) and np.isfinite(image).all() for image in images)
