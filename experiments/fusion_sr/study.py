@@ -68,6 +68,8 @@ class Variant:
     method: str
     arguments: dict[str, Any] | None = None
     """Of the network; None for a method that learns nothing."""
+    learning_rate: float = 1e-3
+    """By `rates.py`."""
 
     def build(self) -> Method:
         """The method with the loss of the study."""
@@ -174,6 +176,7 @@ def run(name: str, seed: int, data: tuple[Path, ...], runs: Path, clips: list[Pa
         ready = find_method(variant.method, SCALE)
     else:
         config, method = replace(BUDGET, seed=seed, data=data, out=out), variant.build()
+        config = replace(config, learning_rate=variant.learning_rate)
         ready = find_method(str(train(method, config)), SCALE)
         record = json.loads((out / "config.json").read_text(encoding="utf-8"))
         curve, seconds = log_of(out)

@@ -193,6 +193,11 @@ def document(name: str, runs: Mapping[str, list[dict[str, Any]]]) -> dict[str, A
     return {
         "title": table.title,
         "budget": _budget(trained),
+        "learning_rates": {
+            variant: found[0]["config"]["learning_rate"]
+            for variant, found in here.items()
+            if "config" in found[0]
+        },
         "frames": made[0]["scenes"][next(iter(scenes))]["frames"],
         "seeds": {
             variant: [run["seed"] for run in found if "seed" in run] for variant, found in here.items()
@@ -209,7 +214,7 @@ def document(name: str, runs: Mapping[str, list[dict[str, Any]]]) -> dict[str, A
 
 def _budget(trained: list[dict[str, Any]]) -> dict[str, Any]:
     config = trained[0]["config"]
-    names = ("steps", "batch", "crop", "scale", "learning_rate", "schedule", "clip_norm")
+    names = ("steps", "batch", "crop", "scale", "schedule", "clip_norm")
     return {name: config[name] for name in names} | {"clips": len(trained[0]["sequences"])}
 
 
@@ -256,11 +261,16 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
             cells += [f"{cost['parameters']:,}", f"{cost['multiply_adds_per_px']:,.0f}"]
             lines.append(f"| {scene} | {VARIANTS[name].label} | {' | '.join(cells)} |")
     budget, seeds = found["budget"], {tuple(s) for s in found["seeds"].values() if s}
+    rates: dict[float, list[str]] = {}
+    for name, rate in found["learning_rates"].items():
+        rates.setdefault(rate, []).append(VARIANTS[name].label)
+    few = len(rates) < 2
+    words = ", ".join(f"{rate:g}" + ("" if few else f" ({', '.join(of)})") for rate, of in rates.items())
     each = " or ".join(", ".join(map(str, s)) for s in sorted(seeds))
     lines += [
         "",
         f"x{budget['scale']}; {budget['steps']} steps of {budget['batch']} crops of {budget['crop']} px from "
-        f"{budget['clips']} clips, Adam {budget['learning_rate']:g}, {budget['schedule']}; seed {each}; "
+        f"{budget['clips']} clips, Adam, rate {words}, {budget['schedule']}; seed {each}; "
         f"{found['hours']} h on {' and '.join(found['devices'])}; commit {', '.join(found['commits'])}; "
         f"measured {', '.join(found['dates'])} on frames {found['frames'][0]} to {found['frames'][-1]} of "
         f"each test clip. Display-referred: {found['display']}.",
