@@ -46,7 +46,6 @@ def main(
         runs: folder for the runs.
     """
     clips, file = training_clips(data), RESULTS / "rates.json"
-    found = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     for name, variant in chosen(names).items():
         for rate in rates:
             out = runs / f"rates-{name}-{rate:g}"
@@ -54,6 +53,7 @@ def main(
             train(variant.build(), replace(config, data=clips, out=out))
             curve, seconds = log_of(out)
             last = [row for row in curve if "eval/psnr" in row][-1]
+            found = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
             found[f"{name} {rate:g}"] = {
                 "steps": steps,
                 "psnr": last["eval/psnr"],
