@@ -8,10 +8,12 @@ round (median, quartiles; compilation apart). Times do not depend on weights: th
 of `study.py`, and RCAN and RRN of the published sizes as well (RCAN in one round: it takes a minute).
 
 `render` renders one frame of each test clip: HR and LR colour with so many samples, and the G-buffer, all on
-the CPU. The seconds are CPU seconds of Blender from one image to the next, saving included; what each frame
-needs first (the scene, its acceleration structure) falls on an image that does not count.
+the CPU; scenes that have numbers are not rendered again (`--again`). The seconds are CPU seconds of Blender
+from one image to the next, saving included. A frame begins with its HR G-buffer, so the step from the frame
+before it falls on that; building the scene does not count.
 
-Both write into experiments/results/fusion_sr/ (runtime.json, render.json) and docs/results_fusion_sr.md.
+Both write into experiments/results/fusion_sr/ (runtime and render, .json and .md), docs/images/ and
+docs/results_fusion_sr.md.
 """
 
 import json
@@ -27,18 +29,20 @@ ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
 
 import jax  # noqa: E402
+import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 from flax import nnx  # noqa: E402
 
 from benchmarks._common import environment, summarise, time_interleaved  # noqa: E402
 from experiments.fusion_sr.study import RESULTS, VARIANTS, Variant  # noqa: E402
-from experiments.fusion_sr.tables import PAGE, on_page, write  # noqa: E402
+from experiments.fusion_sr.tables import IMAGES, PAGE, on_page, write  # noqa: E402
 from experiments.make_datasets import SCENES, device  # noqa: E402
 from experiments.provenance import commit  # noqa: E402
 from jaxsr.data import analytic  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.cost import count_parameters, multiply_adds_of  # noqa: E402
 from jaxsr.io import blender  # noqa: E402
+from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.methods import METHODS  # noqa: E402
 
 SIZE, SCALE = (1920, 1080), 4
@@ -92,8 +96,11 @@ def methods(rounds: int = 5) -> None:
     """Time a step of every method.
 
     Args:
-        rounds: timed calls of each method.
+        rounds: timed calls of each method, at least two.
     """
+    if rounds < 2:
+        raise JaxsrError("bad rounds", where="--rounds", expected="a whole number from 2", found=rounds)
+    about = environment() | {"size": SIZE, "scale": SCALE, "rounds": rounds}  # the load is that before
     variants = {name: (VARIANTS | PUBLISHED)[name] for name in TIMED}
     calls, costs = {}, {}
     for name, variant in variants.items():
@@ -106,11 +113,25 @@ def methods(rounds: int = 5) -> None:
         ratio = ms[0] / statistics.median(times["fusion"])
         found[name] = {"median_ms": ms[0], "iqr_ms": None, "ratio": ratio}
     rows = {name: found[name] | costs[name] | {"paper_ms": PAPER_MS.get(name)} for name in TIMED}
-    about = environment() | {"size": SIZE, "scale": SCALE, "rounds": rounds}
+    rows["fusion"]["cpu_ms"] = cpu_ms(calls["fusion"], rounds)
     write(RESULTS / "runtime.json", json.dumps({"about": about, "methods": rows}, indent=1) + "\n")
-    lines = runtime_table(rows, about)
-    write(PAGE, on_page(PAGE.read_text(encoding="utf-8"), "runtime", lines))
+    put("runtime", runtime_table(rows, about))
+
+
+def put(name: str, lines: list[str], picture: str = "") -> None:
+    """A table into its file, the page and the terminal."""
+    write(RESULTS / f"{name}.md", "\n".join([*lines, ""]))
+    block = [*lines, "", picture] if picture else lines
+    write(PAGE, on_page(PAGE.read_text(encoding="utf-8"), name, block))
     print("\n".join(lines))
+
+
+def cpu_ms(call: Callable[[], Any], rounds: int) -> float:
+    """Milliseconds of a call summed over the cores, the unit in which Blender's images are measured."""
+    start = time.process_time()
+    for _ in range(rounds):
+        jax.block_until_ready(call())
+    return (time.process_time() - start) * 1e3 / rounds
 
 
 def _once(call: Callable[[], Any]) -> float:
@@ -148,6 +169,7 @@ def render(
     blender_path: Path | None = None,
     samples: int = 16,
     size: tuple[int, int] = SIZE,
+    again: bool = False,
 ) -> None:
     """Time what Blender renders.
 
@@ -155,9 +177,20 @@ def render(
         blender_path: see `jaxsr render --blender`.
         samples: of the colour.
         size: of the HR frames.
+        again: render what has numbers already.
     """
-    found = {}
+    runtime, file = RESULTS / "runtime.json", RESULTS / "render.json"
+    if not runtime.is_file():
+        raise JaxsrError("no time of the network", where=runtime, fix="run `timing.py methods` first")
+    times = json.loads(runtime.read_text(encoding="utf-8"))
+    about = {"size": list(size), "scale": SCALE, "samples": samples, "device": device()}
+    known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() and not again else {}
+    same = {key: known.get("about", {}).get(key) for key in about} == about
+    found = dict(known["seconds"]) if same else {}
+    about |= {"commit": commit(), "date": time.strftime("%Y-%m-%d")}
     for scene in SCENES:
+        if scene in found:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             colors = _images(scene, Path(folder) / "colors", 1, samples, size, blender_path)
             buffers = _images(scene, Path(folder) / "buffers", 2, 1, size, blender_path)
@@ -167,13 +200,36 @@ def render(
             "hr": colors["frame 1, hr color"],
         }
         print(scene, found[scene], flush=True)
-    about = {"size": size, "scale": SCALE, "samples": samples, "device": device(), "commit": commit()}
-    about["date"] = time.strftime("%Y-%m-%d")
-    write(RESULTS / "render.json", json.dumps({"about": about, "seconds": found}, indent=1) + "\n")
-    runtime = json.loads((RESULTS / "runtime.json").read_text(encoding="utf-8"))
-    lines = render_table(found, about, runtime)
-    write(PAGE, on_page(PAGE.read_text(encoding="utf-8"), "table2", lines))
-    print("\n".join(lines))
+        write(file, json.dumps({"about": about, "seconds": found}, indent=1) + "\n")
+    render_chart(found, times, IMAGES / "fusion_table2.png")
+    put("table2", render_table(found, about, times), "![Where the time goes](images/fusion_table2.png)")
+
+
+def render_chart(found: dict[str, Any], runtime: dict[str, Any], file: Path) -> None:
+    """A bar a scene and way: G-buffer, LR colour and network on top of each other, beside HR colour."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7, 3.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots()
+    network = runtime["methods"]["fusion"]["cpu_ms"] / 1e3
+    left = np.zeros(len(found))
+    rows = np.arange(len(found))
+    for label, values in (
+        ("G-buffer", [found[scene]["gbuffer"] for scene in found]),
+        ("LR colour", [found[scene]["lr"] for scene in found]),
+        ("network", [network] * len(found)),
+    ):
+        axes.barh(rows - 0.2, values, 0.36, left=left, label=label)
+        left = left + np.array(values)
+    axes.barh(rows + 0.2, [found[scene]["hr"] for scene in found], 0.36, label="HR colour", color="tab:gray")
+    axes.set_yticks(rows, list(found))
+    axes.invert_yaxis()
+    axes.set_xlabel("CPU seconds")
+    axes.legend()
+    with atomic_path(file) as temporary:
+        figure.savefig(temporary, format="png", dpi=100)
 
 
 def _images(
@@ -204,7 +260,7 @@ def _images(
 
 def render_table(found: dict[str, Any], about: dict[str, Any], runtime: dict[str, Any]) -> list[str]:
     """Markdown of `render.json`, with the network's time beside it."""
-    network = runtime["methods"]["fusion"]["median_ms"] / 1e3
+    network = runtime["methods"]["fusion"]["cpu_ms"] / 1e3
     width, height = about["size"]
     low = f"{width // SCALE}x{height // SCALE}"
     lines = [
@@ -229,9 +285,9 @@ def render_table(found: dict[str, Any], about: dict[str, Any], runtime: dict[str
     return [
         *lines,
         "",
-        f"Blender: CPU seconds, Cycles, {about['samples']} samples a pixel (G-buffer: 1), {about['device']}, "
-        f"commit {about['commit']}, {about['date']}. Network: wall time on {runtime['about']['cores']} cores "
-        f"of {runtime['about']['device']}.",
+        f"CPU seconds, summed over cores: of Blender (Cycles, {about['samples']} samples a pixel, G-buffer 1; "
+        f"{about['device']}; commit {about['commit']}, {about['date']}), and of the network "
+        f"({runtime['about']['device']}).",
     ]
 
 
