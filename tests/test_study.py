@@ -1,5 +1,6 @@
 """The experiments of the fusion paper: what is trained, the tables, and the page with their numbers."""
 
+import dataclasses
 import importlib.util
 import json
 
@@ -8,15 +9,28 @@ import numpy as np
 import pytest
 from flax import nnx
 
-from experiments.fusion_sr import flicker, study, tables, timing
+from experiments.fusion_sr import flicker, rates, study, tables, timing
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.cost import count_parameters
 from jaxsr.evaluation.run import find_method, stream
+from jaxsr.io.images import read_png
 from jaxsr.methods import LEARNED
 from jaxsr.training import TrainConfig, train
 from tests.builders import make_sequence
 
 LEARNING = [name for name, variant in study.VARIANTS.items() if variant.arguments is not None]
+
+WEIGHTS = {
+    "rcan": 2_009_235,
+    "nsrr": 547_767,
+    "rrn": 501_936,
+    "fusion": 418_619,
+    "fusion-guided": 418_616,
+    "concat": 358_363,
+    "add": 318_939,
+    "unet": 506_907,
+    "depth-only": 418_627,
+}
 
 
 def made(name, seed=0, psnr=20.0, **changes):
@@ -26,7 +40,7 @@ def made(name, seed=0, psnr=20.0, **changes):
     found = {
         "name": name,
         "scenes": dict.fromkeys(tables.SCENES, scene),
-        "measured": {"display": "sRGB", "date": "2026-01-01"},
+        "measured": {"display": "sRGB", "date": "2026-01-01", "commit": "abc"},
         "cost": {"parameters": 7, "multiply_adds_per_px": 8.0},
     }
     if study.VARIANTS[name].arguments is not None:
@@ -34,6 +48,7 @@ def made(name, seed=0, psnr=20.0, **changes):
         found |= {
             "seed": seed,
             "config": config | {"schedule": "cosine", "clip_norm": 1.0},
+            "arguments": json.loads(json.dumps(dict(study.VARIANTS[name].build().arguments))),
             "sequences": ["clip hash"],
             "trained": {"commit": "abc", "device": "cpu", "seconds": 3600},
         }
@@ -90,10 +105,11 @@ def test_a_number_is_the_mean_over_frames_then_seeds():
 
 
 def test_a_table_has_the_papers_numbers_beside_ours():
-    runs = {name: [made(name)] for name in tables.TABLES["table5"].variants}
+    runs = {name: [made(name, psnr=20.0 - (name == "nsrr"))] for name in tables.TABLES["table5"].variants}
     found = tables.document("table5", runs)
     lines = tables.markdown(found)
-    assert "| docks | NSRR | 20.00 | 20.79 | 0.5000 | 0.7006 | 20.00 | 7 | 8 |" in lines
+    assert "| docks | NSRR | 19.00 | 20.79 | -1.00 | 0.5000 | 0.7006 | 19.00 | 7 | 8 |" in lines
+    assert "| docks | fusion | 20.00 | 25.37 |  | 0.5000 | 0.8705 | 20.00 | 7 | 8 |" in lines
     assert "3 steps of 1 crops of 8 px from 1 clips" in lines[-1]
     assert "commit abc" in lines[-1]
 
@@ -101,9 +117,12 @@ def test_a_table_has_the_papers_numbers_beside_ours():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"config": made("nsrr")["config"] | {"steps": 4}}, "budget and data"),
-        ({"sequences": ["other hash"]}, "training clips"),
-        ({"measured": {"display": "linear", "date": ""}}, "display"),
+        ({"config": made("nsrr")["config"] | {"steps": 4}}, "options of nsrr"),
+        ({"config": made("nsrr")["config"] | {"flips": False}}, "options of nsrr"),
+        ({"sequences": ["clip other"]}, "training clips of nsrr"),
+        ({"arguments": {}}, "nsrr was another network"),
+        ({"measured": {"display": "linear", "date": "", "commit": None}}, "display of nsrr"),
+        ({"seed": 1}, "same seeds"),
     ],
 )
 def test_a_table_of_unequal_runs_is_an_error(changes, message):
@@ -111,6 +130,26 @@ def test_a_table_of_unequal_runs_is_an_error(changes, message):
     runs["nsrr"] = [made("nsrr", **changes)]
     with pytest.raises(JaxsrError, match=message):
         tables.document("table5", runs)
+
+
+def test_differences_are_seed_against_seed():
+    ours = [made("concat", 0, 20.0), made("concat", 1, 23.0)]
+    fusion = [made("fusion", 0, 21.0), made("fusion", 1, 22.0)]
+    assert tables.difference(ours, fusion, "docks") == (0.0, 1.0, 2)
+    assert tables.difference([made("taau", psnr=20.0)], fusion, "docks") == (-1.5, 0.5, 2)
+    assert tables.difference(fusion, fusion, "docks") is None
+
+
+def test_learning_rates_are_those_that_were_best():
+    """Of each architecture; others have that of theirs."""
+    files = {file.stem: json.loads(file.read_text()) for file in (study.RESULTS / "rates").glob("*.json")}
+    for name in rates.ARCHITECTURES if files else ():
+        psnr = {
+            f["config"]["learning_rate"]: f["curve"][-1]["eval/psnr"]
+            for f in files.values()
+            if f["name"] == name
+        }
+        assert study.VARIANTS[name].learning_rate == max(psnr, key=psnr.get), name
 
 
 def test_a_table_without_a_run_names_the_command():
@@ -152,7 +191,7 @@ def test_the_page_has_the_numbers_of_flicker_and_timing(name):
         return
     found = json.loads(file.read_text())
     if name == "figure9":
-        lines = flicker.table(found["errors"])
+        lines = flicker.table(found["old_color"], found["tiles"])
     elif name == "runtime":
         lines = timing.runtime_table(found["methods"], found["about"])
     else:
@@ -161,21 +200,30 @@ def test_the_page_has_the_numbers_of_flicker_and_timing(name):
     assert block(name)[: len(lines)] == lines
 
 
-def test_flicker_sees_colour_and_not_blur():
-    grey, tile = np.full((4, 48, 48, 3), 0.5), flicker.TILE
-    truths = grey.copy()
-    truths[1::2, :tile, : 2 * tile, 0] = 0.8  # a red lamp on two tiles, every second frame
-    lit = flicker.lit_tiles(truths)
-    assert lit.sum() == 2
-    assert lit[0, :2].all()
-    late = np.concatenate([truths[:1], truths[:-1]])
-    got = flicker.errors(late, truths, lit)
-    assert got[0] == 0
-    assert got[1] == pytest.approx(255 * 0.3 / np.sqrt(3), abs=1e-2)
-    sharper = truths + 0.1 * np.resize([1, -1], (48, 1))
-    assert flicker.errors(sharper, truths, lit) == pytest.approx([0] * 4, abs=1e-2)
+def test_old_colour_is_seen_and_blur_is_not():
+    tile, grey = flicker.TILE, np.full((48, 48, 3), 0.5)
+    lit = grey.copy()
+    lit[:tile, : 2 * tile, 0] = 0.8  # a red lamp on two tiles
+    nowhere = np.zeros((48, 48), bool)
+    lamp = flicker.lamp(lit, grey, nowhere)
+    assert lamp.lit.sum() == 2
+    assert lamp.lit[0, :2].all()
+    assert flicker.old_color(lit, lamp) == 0
+    assert flicker.old_color(grey, lamp) == 1
+    assert flicker.old_color(0.75 * lit + 0.25 * grey, lamp) == pytest.approx(0.25)
+    assert flicker.old_color(lit + 0.1 * np.resize([1, -1], (48, 1)), lamp) == pytest.approx(0, abs=1e-4)
+    assert flicker.old_color(lit + np.array([0, 0.1, 0.1]), lamp) == pytest.approx(
+        0
+    )  # wrong, but not the old colour
+    hidden = nowhere.copy()
+    hidden[: tile // 2] = True
+    assert flicker.old_color(grey, flicker.lamp(lit, grey, hidden)) is None
+
+
+def test_a_clip_without_a_lamp_is_an_error(tmp_path):
+    still = make_sequence(tmp_path / "clip", frames=2, scales=(4,), size=(64, 48), still=True, frozen=True)
     with pytest.raises(JaxsrError, match="no lamp"):
-        flicker.lit_tiles(grey)
+        flicker.lamps(still)
 
 
 def test_frames_that_are_not_there_name_the_command(tmp_path):
@@ -205,3 +253,44 @@ def test_the_worked_example_trains_and_runs(example, tmp_path):
     assert count_parameters(ready.net) == 9 * 9 * 16 + 16 + 9 * 16 * 3 + 3
     images = [out.image for out in stream(ready.method, (sequence.frame(i, 4) for i in range(3)), ready.net)]
     assert all(image.shape == (48, 64, 3) and np.isfinite(image).all() for image in images)
+
+
+@pytest.mark.slow
+def test_from_clips_to_a_table(tmp_path, monkeypatch):
+    """Train, measure, tabulate: two networks for two steps on tiny clips; all again makes nothing anew."""
+    clips = [tmp_path / f"{scene}-test-0" for scene in tables.SCENES]
+    for clip in clips:
+        make_sequence(clip, frames=6, scales=(4,), size=(64, 48))
+    monkeypatch.setattr(study, "training_clips", lambda data: tuple(clips))
+    budget = {"steps": 2, "batch": 1, "crop": 32, "eval_every": 2, "cache": tmp_path / "cache"}
+    monkeypatch.setattr(study, "BUDGET", dataclasses.replace(study.BUDGET, **budget))
+
+    def sample(out, split, scenes=(), scale=None):
+        return [clip for clip in clips if not scenes or clip.name.split("-")[0] in scenes]
+
+    for module in (study, tables):
+        monkeypatch.setattr(module, "unpack_sample", sample)
+    results, runs, page, images = (tmp_path / name for name in ("results", "runs", "page.md", "images"))
+    monkeypatch.setattr(tables, "RESULTS", results)
+    monkeypatch.setattr(tables, "PAGE", page)
+    monkeypatch.setattr(tables, "IMAGES", images)
+    table = tables.Table("Test", ("taau", "add", "fusion"), {}, ("docks",))
+    monkeypatch.setitem(tables.TABLES, "test", table)
+    page.write_text("<!-- test -->\n<!-- end of test -->\n")
+
+    study.main(("taau", "add", "fusion"), seeds=(0, 1), runs=runs, results=results)
+    files = {file.name: file.read_bytes() for file in results.iterdir()}
+    assert sorted(files) == ["add-s0.json", "add-s1.json", "fusion-s0.json", "fusion-s1.json", "taau.json"]
+    study.main(("taau", "add", "fusion"), seeds=(0, 1), runs=runs, results=results)
+    assert {file.name: file.read_bytes() for file in results.iterdir()} == files
+    one = json.loads(files["add-s1.json"])
+    assert one["seed"] == one["config"]["seed"] == 1
+    assert one["curve"][-1]["step"] == 2
+    assert one["scenes"]["docks"]["frames"] == [5, 6]
+    assert "out" not in one["config"]
+
+    tables.main(("test",), runs=runs)
+    assert len([line for line in page.read_text().splitlines() if line.startswith("| docks")]) == 3
+    assert (results / "test.md").read_text().count("±") > 6
+    assert read_png(images / "fusion_test.png").shape[2] == 3
+    assert read_png(images / "fusion_test_docks.png").shape[2] == 3

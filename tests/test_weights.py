@@ -25,7 +25,7 @@ from jaxsr.nets.fusion_sr import Fusion
 from jaxsr.nets.published import PUBLISHED
 from jaxsr.nets.rcan import MEAN
 from tests.networks import drawn
-from tests.reference import golden_fusion_sr
+from tests.reference import golden_color_nets, golden_fusion_sr
 from tests.test_cli import error_line, run
 
 GOLDENS = Path(__file__).parents[2] / "shared" / "goldens"
@@ -362,6 +362,31 @@ def test_converted_weights_give_the_output_of_pytorch(tmp_path):
     np.savez(source := tmp_path / "published.npz", **golden_fusion_sr.weights(golden))
     made = converted_output(source, tmp_path / "converted.safetensors", *golden_fusion_sr.inputs())
     np.testing.assert_allclose(made, expected, atol=1e-4 * np.abs(expected).max())
+
+
+def color_golden(name, shapes, tmp_path):
+    """Outputs of a network in PyTorch, and ours with the same weights."""
+    arrays = golden_fusion_sr.weights(shapes)
+    arrays |= golden_color_nets.shifts() if name == "rcan" else {}
+    np.savez(source := tmp_path / "published.npz", **arrays)
+    golden = np.load(Path(golden_color_nets.__file__).with_suffix(".npz"))
+    return golden, *converted(source, tmp_path / "converted.safetensors")
+
+
+def test_a_converted_rcan_gives_the_output_of_pytorch(tmp_path):
+    golden, run, state = color_golden("rcan", golden_color_nets.rcan_shapes(), tmp_path)
+    made = run(state, golden_color_nets.frames()[0])
+    np.testing.assert_allclose(made, golden["rcan"], atol=1e-4 * np.abs(golden["rcan"]).max())
+
+
+def test_a_converted_rrn_gives_the_outputs_of_pytorch(tmp_path):
+    golden, run, state = color_golden("rrn", golden_color_nets.rrn_shapes(), tmp_path)
+    frames, expected = golden_color_nets.frames(), golden["rrn"]
+    hidden, made = jnp.zeros(golden["hidden"].shape), jnp.zeros(expected[0].shape)
+    for t in range(golden_color_nets.STEPS):
+        made, hidden = run(state, frames[t], frames[t + 1], hidden, made)
+        np.testing.assert_allclose(made, expected[t], atol=1e-4 * np.abs(expected).max())
+    np.testing.assert_allclose(hidden, golden["hidden"], atol=1e-4 * np.abs(golden["hidden"]).max())
 
 
 # A .pth file by hand: a ZIP archive of a pickle, whose opcodes are written here, and of raw storages.

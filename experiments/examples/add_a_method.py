@@ -1,7 +1,4 @@
-"""A method of your own, trained and compared: two convolutions over bicubic colour and the HR G-buffer.
-
-python experiments/examples/add_a_method.py [--steps 150] [--out example]
-"""
+"""A method of your own, trained and compared: `python experiments/examples/add_a_method.py --steps 150`."""
 
 from dataclasses import make_dataclass
 from pathlib import Path
@@ -37,21 +34,22 @@ def loss(net, window):  # of a batch of windows; here their last frames are all 
     return jnp.mean(jnp.abs(jax.vmap(net)(frames) - jax.vmap(to_display)(truth, frames.exposure))), {}
 
 
-def step(net, state, frame):  # one frame; `state` is what goes from frame to frame: nothing here
+def step(net, state, frame):  # one frame; `state` is what goes from frame to frame
     module = nnx.merge(nnx.graphdef(nnx.eval_shape(lambda: Net(nnx.Rngs(0)))), net)
-    return state, from_display(jnp.clip(module(frame), 0, 1)) / frame.exposure
+    image = from_display(jnp.clip(module(frame), 0, 1)) / frame.exposure
+    return (jnp.where(frame.rendered, image, state),) * 2  # where nothing was rendered, the last again
 
 
 NEEDS = frozenset({"lr.color", "hr.base_color", "hr.normal"})
-MINE = Method("mine", "two convolutions", lambda frame: (), step, NEEDS, Net, loss)
+MINE = Method("mine", "a network", lambda f: jnp.zeros_like(f.hr.normal), step, NEEDS, Net, loss)
 LEARNED["mine"] = Learned(make_dataclass("Options", []), lambda _: MINE)  # how its weights find it
 
 
 def main(steps: int = 150, out: Path = Path("example")) -> None:
     weights = train(MINE, TrainConfig(steps=steps, out=out / "mine"))
-    clips, methods = unpack_sample(out / "sample", "test"), ["taau", "fusion-sr", str(weights)]
-    with bars() as progress:
-        evaluate(clips, methods, out / "compared", Settings(4), progress=progress)
+    clips, names = unpack_sample(out / "sample", "test"), ("taau", "fusion-sr", str(weights))
+    with bars() as bar:
+        evaluate(clips, names, out / "compared", Settings(4), progress=bar)
     print((out / "compared" / "metrics.md").read_text())
 
 

@@ -1,22 +1,28 @@
-"""Figure 9: a lamp changes its colour on every frame; who looks at past frames shows the wrong one.
+"""Figure 9: a lamp changes its colour on every frame; who looks at past frames shows the old one.
 
     python experiments/fusion_sr/flicker.py [--runs DIR]
 
 Reads what the methods of `study.py` made of the bunker's test clip, all of its frames, from the folder of the
-runs (seed 0). The frame is cut into tiles; those count that the lamp lights, whose mean colour in the truth
-changes by more than `CHANGE` from one frame to the next. The error of a frame is the distance (RMS over
-channels) between the mean colours of a tile in the output and in the truth, averaged over these tiles: blur
-within a tile does not count, a wrong colour does. Display-referred, in units of 1/255.
+runs (seed 0). For each frame t and tile, c is the mean colour of the truth, p that of the previous truth
+warped to it by the motion: what history holds there. Tiles count where |p - c| is more than `CHANGE` (RMS
+over channels), that is where the lamp shines and has changed; those that are disoccluded by more than a tenth
+(`HIDDEN`) do not. With o the mean colour that a method made,
 
-Writes experiments/results/fusion_sr/flicker.json, docs/images/fusion_flicker_strip.png, a row a method and a
-column a frame, docs/images/fusion_flicker.png, the curves, and its part of docs/results_fusion_sr.md.
+    old colour = sum (o - c).(p - c) / sum (p - c).(p - c)      over the tiles of a frame
+
+is 0 where the colour is that of this frame, 1 where it is still that of the frame before. Blur within a tile
+and errors that have nothing to do with the old colour do not count. Display-referred.
+
+Writes experiments/results/fusion_sr/flicker.json and .md, docs/images/fusion_flicker_strip.png, a row a
+method and a column a frame, docs/images/fusion_flicker.png, the curves, and its part of
+docs/results_fusion_sr.md.
 """
 
 import json
 import sys
 import tempfile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
@@ -31,49 +37,79 @@ from experiments.provenance import commit  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
 from jaxsr.evaluation.measuring import display  # noqa: E402
+from jaxsr.evaluation.regions import disocclusions  # noqa: E402
 from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.images import read_png, write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
+from jaxsr.ops import backward_warp  # noqa: E402
 
 CURRENT = ("bicubic", "rcan", "fusion", "fusion-guided")
 HISTORY = ("taau", "guided-taau", "nsrr", "rrn")
 STRIP = ("taau", "nsrr", "rrn", "fusion")
-TILE, CHANGE = 12, 12 / 255
+TILE, CHANGE, HIDDEN = 12, 12 / 255, 0.1
 WINDOW = (108, 96)
 """Width and height of the crop in the strip: where most lit tiles are."""
 FRAMES = (2, 3, 4, 5, 6, 7)
 """Positions in the clip of the columns."""
 ZOOM, LABEL = 2, 90
 
+Curves = dict[str, list[float | None]]
+
 
 def tile_means(image: np.ndarray) -> np.ndarray:
-    """Mean colours [H / TILE, W / TILE, 3]; what is left over at the right and below is dropped."""
+    """Means [H / TILE, W / TILE, C]; what is left over at the right and below is dropped."""
     height, width = (n // TILE * TILE for n in image.shape[:2])
-    cut = image[:height, :width].reshape(height // TILE, TILE, width // TILE, TILE, 3)
+    cut = image[:height, :width].reshape(height // TILE, TILE, width // TILE, TILE, -1)
     return cut.mean((1, 3), dtype=np.float64)
 
 
-def lit_tiles(truths: np.ndarray) -> np.ndarray:
-    """Which tiles the lamp lights, from display-referred frames [T, H, W, 3].
+class Lamp(NamedTuple):
+    """What the lamp does to one frame."""
+
+    color: np.ndarray
+    """c, by tile."""
+    old: np.ndarray
+    """p, by tile."""
+    lit: np.ndarray
+    """Tiles that count."""
+
+
+def lamp(truth: np.ndarray, before: np.ndarray, hidden: np.ndarray) -> Lamp:
+    """Which tiles the lamp has changed.
+
+    Args:
+        truth: display-referred [H, W, 3].
+        before: the previous truth, warped to it.
+        hidden: mask [H, W] of pixels that the previous frame does not show.
+    """
+    color, old = tile_means(truth), tile_means(before)
+    changed = np.sqrt(np.mean((old - color) ** 2, -1)) > CHANGE
+    return Lamp(color, old, changed & (tile_means(hidden[..., None])[..., 0] < HIDDEN))
+
+
+def old_color(image: np.ndarray, lamp: Lamp) -> float | None:
+    """The share of the old colour in a frame; None where no tile counts."""
+    if not lamp.lit.any():
+        return None
+    made, change = (tile_means(image) - lamp.color)[lamp.lit], (lamp.old - lamp.color)[lamp.lit]
+    return round(float(np.sum(made * change) / np.sum(change**2)), 4)
+
+
+def lamps(sequence: FrameSequence) -> list[Lamp]:
+    """Of each frame but the first.
 
     Raises:
-        JaxsrError: none, so that nothing would be measured.
+        JaxsrError: no lamp changes, so that nothing would be measured.
     """
-    colors = np.stack([tile_means(truth) for truth in truths])
-    chroma = colors - colors.mean(-1, keepdims=True)
-    lit = np.sqrt(np.mean(np.diff(chroma, axis=0) ** 2, -1)).max(0) > CHANGE
-    if not lit.any():
-        raise JaxsrError("no lamp changes its colour", where="the truth", expected=f"tiles above {CHANGE}")
-    return lit
-
-
-def errors(frames: np.ndarray, truths: np.ndarray, lit: np.ndarray) -> list[float]:
-    """The error of each frame, in 1/255."""
     found = []
-    for frame, truth in zip(frames, truths, strict=True):
-        apart = np.sqrt(np.mean((tile_means(frame) - tile_means(truth)) ** 2, -1))
-        found.append(round(255 * float(apart[lit].mean()), 3))
+    truths = [display(sequence.truth(i), sequence.exposure) for i in range(len(sequence))]
+    for i in range(1, len(sequence)):
+        now, before = (sequence.frame(k, 1, rendered=False) for k in (i, i - 1))
+        warped = np.asarray(backward_warp(truths[i - 1], now.hr.motion_px))
+        found.append(lamp(truths[i], warped, disocclusions(now, before)))
+    if not any(one.lit.any() for one in found):
+        raise JaxsrError("no lamp changes its colour", where=sequence.path)
     return found
 
 
@@ -96,17 +132,18 @@ def frames_of(name: str, runs: Path, clip: str, count: int) -> np.ndarray:
     return np.stack([read_png(file) for file in files])
 
 
-def busiest(lit: np.ndarray) -> tuple[int, int]:
-    """Left and top, in pixels, of the window with the most lit tiles."""
+def busiest(found: list[Lamp]) -> tuple[int, int]:
+    """Left and top, in pixels, of the window in which most tiles change."""
     height, width = WINDOW[1] // TILE, WINDOW[0] // TILE
-    counts = np.lib.stride_tricks.sliding_window_view(lit, (height, width)).sum((-2, -1))
+    times = np.sum([one.lit for one in found], 0)
+    counts = np.lib.stride_tricks.sliding_window_view(times, (height, width)).sum((-2, -1))
     y, x = np.unravel_index(np.argmax(counts), counts.shape)
     return int(x) * TILE, int(y) * TILE
 
 
-def strip(rows: dict[str, np.ndarray], lit: np.ndarray) -> np.ndarray:
+def strip(rows: dict[str, np.ndarray], found: list[Lamp]) -> np.ndarray:
     """The crops, a row a method and a column a frame, `[H, W, 3]` in 8 bits."""
-    x, y = busiest(lit)
+    x, y = busiest(found)
     width, height = WINDOW[0] * ZOOM, WINDOW[1] * ZOOM
     page = Image.new("RGB", (LABEL + len(FRAMES) * (width + 3), 20 + len(rows) * (height + 3)), "white")
     draw, font = ImageDraw.Draw(page), ImageFont.load_default(13)
@@ -123,8 +160,8 @@ def strip(rows: dict[str, np.ndarray], lit: np.ndarray) -> np.ndarray:
     return np.asarray(page)
 
 
-def chart(curves: dict[str, list[float]], file: Path) -> None:
-    """The error over time: methods of the current frame dashed."""
+def chart(curves: Curves, file: Path) -> None:
+    """The share over time: methods of the current frame dashed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -133,27 +170,32 @@ def chart(curves: dict[str, list[float]], file: Path) -> None:
     axes = figure.subplots()
     for name, curve in curves.items():
         style = "--" if name in CURRENT else "-"
-        axes.plot(range(1, len(curve) + 1), curve, style, marker=".", label=VARIANTS[name].label)
+        shown = [np.nan if v is None else 100 * v for v in curve]
+        axes.plot(range(2, len(curve) + 2), shown, style, marker=".", label=VARIANTS[name].label)
     axes.set_xlabel("frame")
-    axes.set_ylabel("colour error of lit tiles (1/255)")
-    axes.set_ylim(bottom=0)
+    axes.set_ylabel("old colour left (%)")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside right upper", title="dashed: current frame alone")
     with atomic_path(file) as temporary:
         figure.savefig(temporary, format="png", dpi=100)
 
 
-def table(curves: dict[str, list[float]]) -> list[str]:
-    """A row a method: the error of each frame, and the mean over those with a full history."""
-    count = len(next(iter(curves.values())))
+def table(curves: Curves, tiles: list[int]) -> list[str]:
+    """A row a method: the share of each frame, and the mean over the last four."""
     lines = [
-        "| method | sees | " + " | ".join(f"frame {i + 1}" for i in range(count)) + " | mean of 5 to 8 |",
-        "|---|---|" + "---:|" * (count + 1),
+        "| method | sees | "
+        + " | ".join(f"frame {i + 2}" for i in range(len(tiles)))
+        + " | mean of the last 4 |",
+        "|---|---|" + "---:|" * (len(tiles) + 1),
     ]
     for name, curve in curves.items():
         sees = "current frame" if name in CURRENT else "history"
-        numbers = [f"{v:.1f}" for v in (*curve, np.mean(curve[4:]))]
-        lines.append(f"| {VARIANTS[name].label} | {sees} | {' | '.join(numbers)} |")
+        known = [v for v in curve[-4:] if v is not None]
+        cells = [
+            "–" if v is None else f"{100 * v:.1f} %" for v in (*curve, np.mean(known) if known else None)
+        ]
+        lines.append(f"| {VARIANTS[name].label} | {sees} | {' | '.join(cells)} |")
+    lines.append(f"| tiles that changed | | {' | '.join(map(str, tiles))} | |")
     return lines
 
 
@@ -167,33 +209,41 @@ def main(runs: Path = RUNS) -> None:
         (clip,) = unpack_sample(Path(folder), "test", ("bunker",), scale=SCALE)
         sequence = FrameSequence.open(clip)
         count = len(sequence)
+        found = lamps(sequence)
         truths = np.stack([display(sequence.truth(i), sequence.exposure) for i in range(count)])
         inputs = [display(sequence.frame(i, SCALE).color_linear, sequence.exposure) for i in range(count)]
-    lit = lit_tiles(truths)
     made = {name: frames_of(name, runs, sequence.name, count) for name in (*CURRENT, *HISTORY)}
-    curves = {name: errors(frames, truths, lit) for name, frames in made.items()}
-    found: dict[str, Any] = {
+    curves = {
+        name: [old_color(frame, one) for frame, one in zip(frames[1:], found, strict=True)]
+        for name, frames in made.items()
+    }
+    tiles = [int(one.lit.sum()) for one in found]
+    sources = {name: json.loads(results_file(name, 0).read_text(encoding="utf-8")) for name in made}
+    numbers: dict[str, Any] = {
         "sequence": sequence.name,
-        "tiles": int(lit.sum()),
         "tile_px": TILE,
-        "unit": "1/255, display-referred",
-        "errors": curves,
+        "change": CHANGE,
+        "tiles": tiles,
+        "old_color": curves,
+        "trained_at": {name: run["trained"]["commit"] for name, run in sources.items() if "trained" in run},
         "measured": description(commit=commit(), scale=SCALE, seed=0),
     }
-    write(RESULTS / "flicker.json", json.dumps(found, indent=1) + "\n")
+    write(RESULTS / "flicker.json", json.dumps(numbers, indent=1) + "\n")
     low = np.stack([given.repeat(SCALE, 0).repeat(SCALE, 1) for given in inputs])
     rows = {"input": low, **{VARIANTS[name].label: made[name] for name in STRIP}, "truth": truths}
-    write_png(IMAGES / "fusion_flicker_strip.png", strip(rows, lit))
+    write_png(IMAGES / "fusion_flicker_strip.png", strip(rows, found))
     chart(curves, IMAGES / "fusion_flicker.png")
-    lines = table(curves)
+    lines = table(curves, tiles)
+    write(RESULTS / "flicker.md", "\n".join(["# Figure 9: a lamp that changes its colour", "", *lines, ""]))
     block = [
         *lines,
         "",
-        f"{found['tiles']} lit tiles of {TILE}x{TILE} px; seed 0; commit {found['measured']['commit']}.",
+        f"Share of the previous frame's colour where the lamp has changed; tiles of {TILE}x{TILE} px; "
+        f"seed 0; commit {numbers['measured']['commit']}.",
         "",
         "![A row a method, a column a frame](images/fusion_flicker_strip.png)",
         "",
-        "![Error over time](images/fusion_flicker.png)",
+        "![Old colour over time](images/fusion_flicker.png)",
     ]
     write(PAGE, on_page(PAGE.read_text(encoding="utf-8"), "figure9", block))
     print("\n".join(lines))

@@ -1,14 +1,14 @@
 """Which learning rate each architecture of `study.py` gets: the better of a few after a short training.
 
-    python experiments/fusion_sr/rates.py [NAME ...] [--steps 200] [--rates 1e-3 3e-4] [--data DIR]
+    python experiments/fusion_sr/rates.py [NAME ...] [--steps 150] [--rates 1e-3 3e-4] [--data DIR]
 
 The judge is the PSNR of the held-back frames of the training clips; the test frames are not looked at. Seed
-100, which no table uses. Writes experiments/results/fusion_sr/rates.json; goes on where it was stopped.
+100, which no table uses. The buffers and the fusion of a network get the rate of its architecture. Each
+training becomes experiments/results/fusion_sr/rates/NAME-RATE.json and is not made again.
 """
 
 import json
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,20 +18,19 @@ sys.path.insert(0, str(ROOT))
 import tyro  # noqa: E402
 from tyro.conf import Positional  # noqa: E402
 
-from experiments.fusion_sr.study import BUDGET, RESULTS, RUNS, chosen, log_of, training_clips  # noqa: E402
+from experiments.fusion_sr.study import BUDGET, RESULTS, RUNS, chosen, record_of, training_clips  # noqa: E402
 from experiments.fusion_sr.tables import write  # noqa: E402
 from experiments.make_datasets import CACHE  # noqa: E402
-from experiments.provenance import commit  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
-from jaxsr.training.config import device  # noqa: E402
 from jaxsr.training.loop import train  # noqa: E402
 
 SEED = 100
+ARCHITECTURES = ("rcan", "nsrr", "rrn", "fusion", "fusion-guided", "unet")
 
 
 def main(
-    names: Positional[tuple[str, ...]] = ("rcan", "nsrr", "rrn", "fusion"),
-    steps: int = 200,
+    names: Positional[tuple[str, ...]] = ARCHITECTURES,
+    steps: int = 150,
     rates: tuple[float, ...] = (1e-3, 3e-4),
     data: Path = CACHE / "train",
     runs: Path = RUNS,
@@ -45,27 +44,20 @@ def main(
         data: folder of the training set.
         runs: folder for the runs.
     """
-    clips, file = training_clips(data), RESULTS / "rates.json"
+    clips = training_clips(data)
     for name, variant in chosen(names).items():
         for rate in rates:
-            out = runs / f"rates-{name}-{rate:g}"
-            config = replace(BUDGET, steps=steps, learning_rate=rate, seed=SEED, eval_every=steps // 2)
-            train(variant.build(), replace(config, data=clips, out=out))
-            curve, seconds = log_of(out)
-            last = [row for row in curve if "eval/psnr" in row][-1]
-            found = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
-            found[f"{name} {rate:g}"] = {
-                "steps": steps,
-                "psnr": last["eval/psnr"],
-                "ssim": last["eval/ssim"],
-                "loss": last["loss"],
-                "seconds": round(seconds, 1),
-                "device": device(),
-                "commit": commit(),
-                "date": time.strftime("%Y-%m-%d"),
-            }
-            write(file, json.dumps(found, indent=1) + "\n")
-            print(f"{name} {rate:g}: PSNR {last['eval/psnr']:.2f} dB, SSIM {last['eval/ssim']:.4f}")
+            file = RESULTS / "rates" / f"{name}-{rate:g}.json"
+            if not file.is_file():
+                out = runs / f"rates-{name}-{rate:g}"
+                config = replace(BUDGET, steps=steps, learning_rate=rate, seed=SEED, eval_every=steps)
+                train(variant.build(), replace(config, data=clips, out=out))
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write(file, json.dumps({"name": name} | record_of(out), indent=1) + "\n")
+            found = json.loads(file.read_text(encoding="utf-8"))
+            last = found["curve"][-1]
+            words = f"PSNR {last['eval/psnr']:.2f} dB, SSIM {last['eval/ssim']:.4f}"
+            print(f"{name} {rate:g}, {found['config']['steps']} steps: {words}")
 
 
 if __name__ == "__main__":

@@ -7,10 +7,13 @@ measured on the test clips of the sample, and becomes a file `experiments/result
 configuration, learning curve, machine, commit, and every metric of every frame. What has such a file is not
 made again (`--again`), and a training goes on where it was stopped. `tables.py` turns the files into tables.
 
-The same for all: clips, order of the crops, flips, number of steps, schedule, clipping, loss (1 - SSIM + L1
-on display-referred colour), jitter, exposure, tone map. One network for all three scenes. Test frames: the
-last four of each clip; the four before them are shown to every method and not measured, so that history is
-full.
+The same for all: windows of five frames, their order, crops and flips, number of steps, schedule, clipping,
+loss (1 - SSIM + L1 on display-referred colour), exposure, tone map, jittered input. The loss is that of the
+last frame of a window, and for RRN, which is trained through its past, the mean over all five: five times the
+pixels. The learning rate is the better of two for each architecture (`rates.py`). One network for all scenes.
+
+Test frames: the last four of each clip of the sample; the four before them are shown to every method and not
+measured, as many as NSRR looks back.
 """
 
 import csv
@@ -41,13 +44,13 @@ from jaxsr.evaluation.tables import json_value  # noqa: E402
 from jaxsr.evaluation.upscale import Settings, run_track  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
-from jaxsr.methods import Method, build, fusion_sr  # noqa: E402
+from jaxsr.methods import LEARNED, Method, build, fusion_sr  # noqa: E402
 from jaxsr.training.config import TrainConfig  # noqa: E402
 from jaxsr.training.loop import train  # noqa: E402
 
 RESULTS = ROOT / "experiments" / "results" / "fusion_sr"
 RUNS = ROOT / "experiments" / "cache" / "study"
-SCALE, WARM_UP = 4, 4
+SCALE, WARM_UP, WINDOW = 4, 4, 5
 CLIPS = 3
 """Training clips of each scene, of the five that the training set has."""
 LOSS = {"ssim_weight": 1.0, "l1_weight": 1.0, "perceptual_weight": 0.0}
@@ -69,12 +72,14 @@ class Variant:
     arguments: dict[str, Any] | None = None
     """Of the network; None for a method that learns nothing."""
     learning_rate: float = 1e-3
-    """By `rates.py`."""
+    """By `rates.py`, for the architecture."""
 
     def build(self) -> Method:
-        """The method with the loss of the study."""
+        """The method with the loss of the study, as far as it has such options, on windows of one length."""
         assert self.arguments is not None
-        return build(self.method, LOSS | self.arguments)
+        known = {field.name for field in dataclasses.fields(LEARNED[self.method].options)}
+        loss = {name: weight for name, weight in LOSS.items() if name in known}
+        return build(self.method, loss | self.arguments)._replace(window=WINDOW)
 
 
 def without(*names: str) -> dict[str, Any]:
@@ -88,7 +93,7 @@ VARIANTS = {
     "guided-taau": Variant("guided TAAU", "guided-taau"),
     "rcan": Variant("RCAN 5x4x64", "rcan", {"groups": 5, "blocks": 4}),
     "nsrr": Variant("NSRR", "nsrr", {}),
-    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64}),
+    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}),
     "fusion": Variant("fusion", "fusion-sr", PAPER),
     "fusion-guided": Variant("fusion, guided start", "fusion-sr", {}),
     "concat": Variant("concat", "fusion-sr", PAPER | {"fusion": "concat"}),
@@ -137,13 +142,20 @@ def results_file(name: str, seed: int, results: Path = RESULTS) -> Path:
     return results / (f"{name}.json" if VARIANTS[name].arguments is None else f"{name}-s{seed}.json")
 
 
-def log_of(run: Path) -> tuple[list[dict[str, float]], float]:
-    """Loss, and the metrics of the held-back frames, by step; and the seconds that the training took."""
+def record_of(run: Path) -> dict[str, Any]:
+    """What a training was, its learning curve (loss, metrics of the held-back frames) and its time."""
+    record = json.loads((run / "config.json").read_text(encoding="utf-8"))
     with (run / "log.csv").open(encoding="utf-8", newline="") as file:
         rows = list(csv.DictReader(file))
     wanted = ("step", "loss", "eval/psnr", "eval/ssim")
-    curve = [{key: round(float(row[key]), 5) for key in wanted if row.get(key)} for row in rows]
-    return curve, float(rows[-1]["seconds"])
+    folders = ("data", "eval_data", "out", "cache", "init")
+    return {
+        "arguments": record["arguments"],
+        "config": {key: value for key, value in record["config"].items() if key not in folders},
+        "sequences": record["sequences"],
+        "trained": record["made"] | {"seconds": round(float(rows[-1]["seconds"]), 1)},
+        "curve": [{key: round(float(row[key]), 5) for key in wanted if row.get(key)} for row in rows],
+    }
 
 
 def measure(ready: Ready, clips: list[Path], frames: Path) -> dict[str, Any]:
@@ -175,20 +187,10 @@ def run(name: str, seed: int, data: tuple[Path, ...], runs: Path, clips: list[Pa
     if variant.arguments is None:
         ready = find_method(variant.method, SCALE)
     else:
-        config, method = replace(BUDGET, seed=seed, data=data, out=out), variant.build()
-        config = replace(config, learning_rate=variant.learning_rate)
+        config = replace(BUDGET, seed=seed, learning_rate=variant.learning_rate, data=data, out=out)
+        method = variant.build()
         ready = find_method(str(train(method, config)), SCALE)
-        record = json.loads((out / "config.json").read_text(encoding="utf-8"))
-        curve, seconds = log_of(out)
-        folders = ("data", "eval_data", "out", "cache", "init")
-        found |= {
-            "seed": seed,
-            "arguments": record["arguments"],
-            "config": {key: value for key, value in record["config"].items() if key not in folders},
-            "sequences": record["sequences"],
-            "trained": record["made"] | {"seconds": round(seconds, 1)},
-            "curve": curve,
-        }
+        found |= record_of(out) | {"seed": seed}
     return found | measure(ready, clips, out / "frames")
 
 

@@ -151,6 +151,21 @@ def value(runs: list[dict[str, Any]], scene: str, key: str, region: str = "all")
     return Value(statistics.fmean(means), (max(means) - min(means)) / 2, len(means))
 
 
+def difference(runs: list[dict[str, Any]], others: list[dict[str, Any]], scene: str) -> Value | None:
+    """PSNR less that of others, seed against seed; what learns nothing is against each. None for itself."""
+    if runs is others:
+        return None
+    pairs = [
+        (run, other) for run in runs for other in others if run.get("seed", other["seed"]) == other["seed"]
+    ]
+    values = [_psnr(run, scene) - _psnr(other, scene) for run, other in pairs]
+    return Value(statistics.fmean(values), (max(values) - min(values)) / 2, len(values)) if values else None
+
+
+def _psnr(run: dict[str, Any], scene: str) -> float:
+    return statistics.fmean(run["scenes"][scene]["metrics"]["psnr"])
+
+
 def shown(found: Value | None, key: str) -> str:
     """A cell."""
     if found is None:
@@ -174,7 +189,7 @@ def document(name: str, runs: Mapping[str, list[dict[str, Any]]]) -> dict[str, A
             fix=f"python experiments/fusion_sr/study.py {' '.join(missing)}",
         )
     here = {variant: runs[variant] for variant in table.variants}
-    _check_fair([run for found in here.values() for run in found])
+    _check_fair(here)
     scenes: dict[str, Any] = {}
     for scene in table.paper or SCENES:
         scenes[scene] = {
@@ -182,6 +197,9 @@ def document(name: str, runs: Mapping[str, list[dict[str, Any]]]) -> dict[str, A
                 "measured": {
                     key: found._asdict() for key in KEYS if (found := value(here[variant], scene, key))
                 },
+                "less_fusion": apart._asdict()
+                if (apart := difference(here[variant], here["fusion"], scene))
+                else None,
                 "paper": dict(zip(("psnr", "ssim"), printed, strict=True))
                 if (printed := table.paper.get(scene, {}).get(variant))
                 else None,
@@ -202,7 +220,8 @@ def document(name: str, runs: Mapping[str, list[dict[str, Any]]]) -> dict[str, A
         "seeds": {
             variant: [run["seed"] for run in found if "seed" in run] for variant, found in here.items()
         },
-        "commits": sorted({run["trained"]["commit"] for run in trained}),
+        "commits": sorted({run["trained"]["commit"] or "unknown" for run in trained}),
+        "measured_at": sorted({run["measured"]["commit"] or "unknown" for run in made}),
         "devices": sorted({run["trained"]["device"] for run in trained}),
         "hours": round(sum(run["trained"]["seconds"] for run in trained) / 3600, 2),
         "dates": sorted({run["measured"]["date"] for run in made}),
@@ -218,8 +237,9 @@ def _budget(trained: list[dict[str, Any]]) -> dict[str, Any]:
     return {name: config[name] for name in names} | {"clips": len(trained[0]["sequences"])}
 
 
-def _check_fair(runs: list[dict[str, Any]]) -> None:
+def _check_fair(here: Mapping[str, list[dict[str, Any]]]) -> None:
     """Raise JaxsrError unless all were trained on the same, as long, and measured on the same frames."""
+    runs = [run for found in here.values() for run in found]
     trained = [run for run in runs if "trained" in run]
 
     def same(what: str, of: Callable[[dict[str, Any]], Any], among: list[dict[str, Any]]) -> None:
@@ -230,13 +250,37 @@ def _check_fair(runs: list[dict[str, Any]]) -> None:
                     where=RESULTS,
                     expected=of(among[0]),
                     found=of(run),
-                    fix=f"python experiments/fusion_sr/study.py {run['name']} --again",
+                    fix=f"remove the files and runs of {run['name']}, and run study.py",
                 )
 
-    same("budget and data", lambda run: _budget([run]), trained)
-    same("training clips", lambda run: [clip.split()[0] for clip in run["sequences"]], trained)
-    same("measured frames", lambda run: {s: v["frames"] for s, v in run["scenes"].items()}, runs)
+    def without(run: dict[str, Any], *names: str) -> dict[str, Any]:
+        return {name: value for name, value in run["config"].items() if name not in names}
+
+    # Between methods the learning rate may differ, between seeds of one nothing else.
+    same("options", lambda run: without(run, "seed", "learning_rate"), trained)
+    for found in here.values():
+        same("options", lambda run: without(run, "seed"), [run for run in found if "trained" in run])
+    same("training clips", lambda run: run["sequences"], trained)
+    same("test clips", lambda run: {s: (v["sequence"], v["frames"]) for s, v in run["scenes"].items()}, runs)
     same("display", lambda run: run["measured"]["display"], runs)
+    for run in trained:
+        expected = json.loads(json.dumps(dict(VARIANTS[run["name"]].build().arguments)))
+        if run["arguments"] != expected:
+            raise JaxsrError(
+                f"{run['name']} was another network",
+                where=RESULTS,
+                expected=expected,
+                found=run["arguments"],
+                fix=f"remove the files and runs of {run['name']}, and run study.py",
+            )
+    seeds = {tuple(run["seed"] for run in found) for found in here.values() if "trained" in found[0]}
+    if len(seeds) > 1:
+        raise JaxsrError(
+            "not all were trained with the same seeds",
+            where=RESULTS,
+            found="; ".join(f"{v}: {len(f)} run(s)" for v, f in here.items()),
+            fix="run study.py to its end",
+        )
 
 
 def markdown(found: Mapping[str, Any]) -> list[str]:
@@ -246,6 +290,7 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
     for key in keys:
         unit = f" ({METRICS[key].unit})" if METRICS[key].unit else ""
         head += [METRICS[key].label + unit, *(["paper"] if key in ("psnr", "ssim") else [])]
+        head += ["less fusion"] if key == "psnr" else []
     lines = [
         f"| scene | method | {' | '.join(head)} | weights | multiply-adds / px |",
         "|---|---|" + "---:|" * (len(head) + 2),
@@ -257,6 +302,9 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
                 cells.append(shown(Value(**row["measured"][key]), key))
                 if key in ("psnr", "ssim"):
                     cells.append(f"{row['paper'][key]:.{DIGITS[key]}f}" if row["paper"] else "")
+                if key == "psnr":
+                    apart = row["less_fusion"]
+                    cells.append(shown(Value(**apart), key) if apart else "")
             cost = found["costs"][name]
             cells += [f"{cost['parameters']:,}", f"{cost['multiply_adds_per_px']:,.0f}"]
             lines.append(f"| {scene} | {VARIANTS[name].label} | {' | '.join(cells)} |")
@@ -272,7 +320,8 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
         f"x{budget['scale']}; {budget['steps']} steps of {budget['batch']} crops of {budget['crop']} px from "
         f"{budget['clips']} clips, Adam, rate {words}, {budget['schedule']}; seed {each}; "
         f"{found['hours']} h on {' and '.join(found['devices'])}; commit {', '.join(found['commits'])}; "
-        f"measured {', '.join(found['dates'])} on frames {found['frames'][0]} to {found['frames'][-1]} of "
+        f"measured at {', '.join(found['measured_at'])}, {', '.join(found['dates'])}, on frames "
+        f"{found['frames'][0]} to {found['frames'][-1]} of "
         f"each test clip. Display-referred: {found['display']}.",
     ]
     return lines
@@ -317,7 +366,7 @@ def crops(name: str, scene: str, runs: Path) -> Path | None:
     if len(files) < len(table.variants) or not all(file.is_file() for file in files.values()):
         return None
     truth, given = _truth(scene)
-    metrics = {v: json.loads(results_file(v, 0).read_text(encoding="utf-8")) for v in table.variants}
+    metrics = {v: json.loads(results_file(v, 0, RESULTS).read_text(encoding="utf-8")) for v in table.variants}
     columns = [Shown("input", given, {})]
     for v, file in files.items():
         here = metrics[v]["scenes"][scene]
@@ -370,7 +419,7 @@ def main(names: Positional[tuple[str, ...]] = (), runs: Path = RUNS) -> None:
     """
     if unknown := [name for name in names if name not in TABLES]:
         raise JaxsrError(f"no table {unknown[0]!r}", expected=", ".join(TABLES))
-    found = load()
+    found = load(RESULTS)
     for name in names or TABLES:
         numbers = document(name, found)
         lines = markdown(numbers)

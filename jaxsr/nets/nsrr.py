@@ -12,11 +12,11 @@ of the current frame and `previous` of the others, the newest first, make colour
 and W. What the numbers mean (tone map, depth map) is up to the method; history that is not there is zeros.
 Features have the dtype of the network, the colour is float32 and not clipped. No batch norm.
 
-The paper leaves open, and here is chosen: RGB, not YCbCr; a ReLU after the last of the feature convolutions,
-none after that of the reconstruction, so that black does not stop gradients; max pooling of 2x2 blocks;
-bilinear upsampling with pixel centres aligned, before the skip is put beside; decoder levels of 64, 64 and
-32, 3 channels. At sizes that are no multiples of 4 the maps are padded with zeros, which is how "no sample"
-looks. No weights were published.
+Colour stays RGB (METHODS 6); public re-implementations convert it to YCbCr. Left open, and chosen here: a
+ReLU after the last of the feature convolutions, none after that of the reconstruction, so that black does not
+stop gradients; max pooling of 2x2 blocks; bilinear upsampling with pixel centres aligned, before the skip is
+put beside; decoder levels of 64, 64 and 32, 3 channels. At sizes that are no multiples of 4 the maps are
+padded with zeros, which is how "no sample" looks. No weights were published.
 """
 
 import functools

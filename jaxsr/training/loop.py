@@ -235,12 +235,15 @@ def _data(method: Method, config: TrainConfig, quiet: bool) -> tuple[Loader, Eva
         if identity(path) in seen:
             raise JaxsrError("is in --data and in --eval-data", where=path, fix="evaluate on other sequences")
         if held_back and len(clip := Sequence.open(path)) < method.window + held_back:
+            fits = len(clip) >= method.window
             raise JaxsrError(
                 "too short to hold back a frame for evaluation",
                 where=path,
                 expected=f"at least {method.window + held_back} frames",
                 found=len(clip),
-                fix="name sequences to evaluate on with --eval-data",
+                fix="name sequences to evaluate on with --eval-data"
+                if fits
+                else "bring longer ones with --data",
             )
     with contextlib.nullcontext() if quiet else bars() as progress:
         shared: Any = {"scale": config.scale, "held_back": held_back, "cache": config.cache}
