@@ -1,10 +1,10 @@
-"""Which learning rate each architecture of `study.py` gets: the better of a few after a short training.
+"""Which learning rate each architecture of `study.py` gets: the best of a few after a short training.
 
-    python experiments/fusion_sr/rates.py [NAME ...] [--steps 150] [--rates 1e-3 3e-4] [--data DIR]
+    python experiments/fusion_sr/rates.py [NAME ...] [--steps 150] [--rates 1e-3 ...] [--data DIR]
 
 The judge is the PSNR of the held-back frames of the training clips; the test frames are not looked at. Seed
-100, which no table uses. The buffers and the fusion of a network get the rate of its architecture. Each
-training becomes experiments/results/fusion_sr/rates/NAME-RATE.json and is not made again.
+100, which no table uses. What is made of `fusion` (other buffers, fusion or start, one branch) has its rate.
+Each training becomes experiments/results/fusion_sr/rates/NAME-RATE.json and is not made again.
 """
 
 import json
@@ -25,13 +25,18 @@ from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.training.loop import train  # noqa: E402
 
 SEED = 100
-ARCHITECTURES = ("rcan", "nsrr", "rrn", "fusion", "fusion-guided", "unet")
+ARCHITECTURES = {
+    "rcan": (1e-3, 3e-4),
+    "nsrr": (1e-3, 3e-4),
+    "rrn": (1e-3, 3e-4, 1e-4),  # begins with weights a tenth as large as the others'
+    "fusion": (1e-3, 3e-4),
+}
 
 
 def main(
-    names: Positional[tuple[str, ...]] = ARCHITECTURES,
+    names: Positional[tuple[str, ...]] = tuple(ARCHITECTURES),
     steps: int = 150,
-    rates: tuple[float, ...] = (1e-3, 3e-4),
+    rates: tuple[float, ...] = (),
     data: Path = CACHE / "train",
     runs: Path = RUNS,
 ) -> None:
@@ -40,13 +45,13 @@ def main(
     Args:
         names: of the variants.
         steps: of each training.
-        rates: to try.
+        rates: to try; by default those of `ARCHITECTURES`.
         data: folder of the training set.
         runs: folder for the runs.
     """
     clips = training_clips(data)
     for name, variant in chosen(names).items():
-        for rate in rates:
+        for rate in rates or ARCHITECTURES.get(name, (1e-3, 3e-4)):
             file = RESULTS / "rates" / f"{name}-{rate:g}.json"
             if not file.is_file():
                 out = runs / f"rates-{name}-{rate:g}"

@@ -10,7 +10,7 @@ made again (`--again`), and a training goes on where it was stopped. `tables.py`
 The same for all: windows of five frames, their order, crops and flips, number of steps, schedule, clipping,
 loss (1 - SSIM + L1 on display-referred colour), exposure, tone map, jittered input. The loss is that of the
 last frame of a window, and for RRN, which is trained through its past, the mean over all five: five times the
-pixels. The learning rate is the better of two for each architecture (`rates.py`). One network for all scenes.
+pixels. The learning rate is the best of two or three (`rates.py`). One network for all scenes.
 
 Test frames: the last four of each clip of the sample; the four before them are shown to every method and not
 measured, as many as NSRR looks back.
@@ -59,7 +59,7 @@ PAPER = {"color": "display", "start": "nothing"}
 BUFFERS = fusion_sr.BUFFERS
 
 BUDGET = TrainConfig(
-    scale=SCALE, steps=800, batch=4, crop=96, schedule="cosine", clip_norm=1.0, eval_every=200, save_every=100
+    scale=SCALE, steps=600, batch=4, crop=96, schedule="cosine", clip_norm=1.0, eval_every=300, save_every=100
 )
 
 
@@ -72,7 +72,7 @@ class Variant:
     arguments: dict[str, Any] | None = None
     """Of the network; None for a method that learns nothing."""
     learning_rate: float = 1e-3
-    """By `rates.py`, for the architecture."""
+    """By `rates.py`; of what is made of `fusion`, that of `fusion`."""
 
     def build(self) -> Method:
         """The method with the loss of the study, as far as it has such options, on windows of one length."""
