@@ -6,8 +6,8 @@ Each becomes `experiments/results/fusion_sr/TABLE.json` and `.md`, `docs/images/
 beside the paper's), and its part of `docs/results_fusion_sr.md`. Where the frames of a run are still in the
 folder of the runs, crops are drawn as well: `docs/images/fusion_TABLE_SCENE.png`. Nothing is measured here.
 
-A number is the mean over the measured frames of a scene, then over seeds; behind ± is half the distance
-between the lowest and the highest seed.
+A number is the mean over the measured frames of a scene, then over the seeds that all networks of the table
+were trained with; behind ± is half the distance between the lowest and the highest seed.
 """
 
 import json
@@ -188,7 +188,7 @@ def document(name: str, runs: Mapping[str, list[dict[str, Any]]]) -> dict[str, A
             where=RESULTS,
             fix=f"python experiments/fusion_sr/study.py {' '.join(missing)}",
         )
-    here = {variant: runs[variant] for variant in table.variants}
+    here = _common({variant: runs[variant] for variant in table.variants})
     _check_fair(here)
     scenes: dict[str, Any] = {}
     for scene in table.paper or SCENES:
@@ -237,6 +237,18 @@ def _budget(trained: list[dict[str, Any]]) -> dict[str, Any]:
     return {name: config[name] for name in names} | {"clips": len(trained[0]["sequences"])}
 
 
+def _common(here: dict[str, list[dict[str, Any]]]) -> dict[str, list[dict[str, Any]]]:
+    """The runs of the seeds that all networks were trained with.
+
+    Raises:
+        JaxsrError: there are none.
+    """
+    seeds = [{run["seed"] for run in found} for found in here.values() if "trained" in found[0]]
+    if not (common := set.intersection(*seeds)):
+        raise JaxsrError("no seed that all were trained with", where=RESULTS, fix="run study.py to its end")
+    return {v: [run for run in found if run.get("seed") in {None, *common}] for v, found in here.items()}
+
+
 def _check_fair(here: Mapping[str, list[dict[str, Any]]]) -> None:
     """Raise JaxsrError unless all were trained on the same, as long, and measured on the same frames."""
     runs = [run for found in here.values() for run in found]
@@ -273,14 +285,6 @@ def _check_fair(here: Mapping[str, list[dict[str, Any]]]) -> None:
                 found=run["arguments"],
                 fix=f"remove the files and runs of {run['name']}, and run study.py",
             )
-    seeds = {tuple(run["seed"] for run in found) for found in here.values() if "trained" in found[0]}
-    if len(seeds) > 1:
-        raise JaxsrError(
-            "not all were trained with the same seeds",
-            where=RESULTS,
-            found="; ".join(f"{v}: {len(f)} run(s)" for v, f in here.items()),
-            fix="run study.py to its end",
-        )
 
 
 def markdown(found: Mapping[str, Any]) -> list[str]:
