@@ -309,9 +309,10 @@ def test_rcan_s_loss_is_that_of_the_last_frame():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_it_learns_one_window(name):
-    method = method_of(name)
-    graph, params = nnx.split(drawn(lambda rngs: method.new_net(rngs)))
-    optimizer, seen = optax.adam(5e-3), window([frame_at(t) for t in range(method.window)])
+    """From where training begins, not where `drawn` does: RRN's tame weights take a hundred steps to wake."""
+    method = build(name, SMALL[name] | {"scale": 2, "features": 16})
+    graph, params = nnx.split(method.new_net(nnx.Rngs(0)))
+    optimizer, seen = optax.adam(1e-3), window([frame_at(t) for t in range(method.window)])
 
     @jax.jit
     def step(params, opt):
@@ -324,7 +325,7 @@ def test_it_learns_one_window(name):
         return optax.apply_updates(params, updates), opt, error, grads
 
     opt, errors = optimizer.init(params), []
-    for _ in range(100):
+    for _ in range(400):
         params, opt, error, grads = step(params, opt)
         errors.append(float(error))
     assert errors[-1] < 0.5 * errors[0]

@@ -1,6 +1,6 @@
 """Which learning rate each architecture of `study.py` gets: the best of a few after a short training.
 
-    python experiments/fusion_sr/rates.py [NAME ...] [--steps 150] [--rates 1e-3 ...] [--data DIR]
+    python experiments/fusion_sr/rates.py [NAME ...] [--steps N] [--rates 1e-3 ...] [--data DIR]
 
 The judge is the PSNR of the held-back frames of the training clips; the test frames are not looked at. Seed
 100, which no table uses. What is made of `fusion` (other buffers, fusion or start, one branch) has its rate.
@@ -26,16 +26,17 @@ from jaxsr.training.loop import train  # noqa: E402
 
 SEED = 100
 ARCHITECTURES = {
-    "rcan": (1e-3, 3e-4),
-    "nsrr": (1e-3, 3e-4),
-    "rrn": (1e-3, 3e-4, 1e-4),  # begins with weights a tenth as large as the others'
-    "fusion": (1e-3, 3e-4),
+    "rcan": (150, (1e-3, 3e-4)),
+    "nsrr": (150, (1e-3, 3e-4)),
+    "rrn": (600, (1e-3, 1e-4)),
+    "fusion": (150, (1e-3, 3e-4)),
 }
+"""Steps and rates. RRN begins with tame weights, from which nothing much happens in the first 150 steps."""
 
 
 def main(
     names: Positional[tuple[str, ...]] = tuple(ARCHITECTURES),
-    steps: int = 150,
+    steps: int = 0,
     rates: tuple[float, ...] = (),
     data: Path = CACHE / "train",
     runs: Path = RUNS,
@@ -44,18 +45,19 @@ def main(
 
     Args:
         names: of the variants.
-        steps: of each training.
-        rates: to try; by default those of `ARCHITECTURES`.
+        steps: of each training; by default as in `ARCHITECTURES`.
+        rates: to try; by default as there.
         data: folder of the training set.
         runs: folder for the runs.
     """
     clips = training_clips(data)
     for name, variant in chosen(names).items():
-        for rate in rates or ARCHITECTURES.get(name, (1e-3, 3e-4)):
+        long, several = ARCHITECTURES.get(name, (150, (1e-3, 3e-4)))
+        for rate in rates or several:
             file = RESULTS / "rates" / f"{name}-{rate:g}.json"
             if not file.is_file():
                 out = runs / f"rates-{name}-{rate:g}"
-                config = replace(BUDGET, steps=steps, learning_rate=rate, seed=SEED, eval_every=steps)
+                config = replace(BUDGET, steps=steps or long, learning_rate=rate, seed=SEED)
                 train(variant.build(), replace(config, data=clips, out=out))
                 file.parent.mkdir(parents=True, exist_ok=True)
                 write(file, json.dumps({"name": name} | record_of(out), indent=1) + "\n")
