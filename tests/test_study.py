@@ -154,12 +154,12 @@ def test_learning_rates_are_those_that_were_best():
     """Of each architecture; others have that of theirs."""
     files = {file.stem: json.loads(file.read_text()) for file in (study.RESULTS / "rates").glob("*.json")}
     for name in rates.ARCHITECTURES if files else ():
-        psnr = {
-            f["config"]["learning_rate"]: f["curve"][-1]["eval/psnr"]
+        ssim = {
+            f["config"]["learning_rate"]: f["curve"][-1]["eval/ssim"]
             for f in files.values()
             if f["name"] == name
         }
-        assert study.VARIANTS[name].learning_rate == max(psnr, key=psnr.get), name
+        assert study.VARIANTS[name].learning_rate == max(ssim, key=ssim.get), name
 
 
 def test_a_table_without_a_run_names_the_command():

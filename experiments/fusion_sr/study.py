@@ -93,7 +93,7 @@ VARIANTS = {
     "guided-taau": Variant("guided TAAU", "guided-taau"),
     "rcan": Variant("RCAN 5x4x64", "rcan", {"groups": 5, "blocks": 4}),
     "nsrr": Variant("NSRR", "nsrr", {}),
-    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}, 1e-4),
+    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}),
     "fusion": Variant("fusion", "fusion-sr", PAPER),
     "fusion-guided": Variant("fusion, guided start", "fusion-sr", {}),
     "concat": Variant("concat", "fusion-sr", PAPER | {"fusion": "concat"}),
