@@ -4,7 +4,8 @@
 
 The judge is the SSIM of the held-back frames of the training clips, of which the loss is made for the most
 part; the test frames are not looked at. Seed 100, which no table uses. What is made of `fusion` (other
-buffers, fusion or start, one branch) has its rate. Each training becomes experiments/results/fusion_sr/rates/NAME-RATE.json and is not made again.
+buffers, fusion or start, one branch) has its rate. Each training becomes a file in
+experiments/results/fusion_sr/rates/ and is not made again.
 """
 
 import json
