@@ -466,6 +466,16 @@ def training(name):
     return params, rest, optimizer.init(params), update
 
 
+def test_residuals_may_begin_at_zero():
+    def scales(**options):
+        net = fusion_sr.method(fusion_sr.Options(**options)).new_net(nnx.Rngs(0))
+        return [float(jnp.max(jnp.abs(fusion.norm2.scale[...]))) for fusion in net.fusions]
+
+    assert scales() == [1, 1, 1]
+    assert scales(residual="zero") == [0, 0, 0]
+    fusion_sr.method(fusion_sr.Options(residual="zero", fusion="concat")).new_net(nnx.Rngs(0))  # has none
+
+
 def test_the_loss_falls_on_one_window():
     params, rest, opt, update = training("default")
     seen = window(frame_at(0), frame_at(2))

@@ -96,6 +96,7 @@ VARIANTS = {
     "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}),
     "fusion": Variant("fusion", "fusion-sr", PAPER),
     "fusion-guided": Variant("fusion, guided start", "fusion-sr", {}),
+    "fusion-zero": Variant("fusion, residuals from 0", "fusion-sr", PAPER | {"residual": "zero"}),
     "concat": Variant("concat", "fusion-sr", PAPER | {"fusion": "concat"}),
     "add": Variant("add", "fusion-sr", PAPER | {"fusion": "add"}),
     "unet": Variant("single-branch U-Net", "fusion-sr", PAPER | {"architecture": "unet"}),

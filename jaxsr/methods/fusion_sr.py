@@ -57,6 +57,8 @@ class Options(ImageLoss):
     """Two encoders with fusion modules, or the single-branch U-Net of the paper's Figure 11."""
     fusion: Literal["se-residual", "concat", "add"] = "se-residual"
     """How features meet (Table 3)."""
+    residual: Literal["published", "zero"] = "published"
+    """How the residuals of "se-residual" begin: with the unit variance of their batch norm, or at 0."""
     buffers: tuple[str, ...] = BUFFERS
     """HR buffers that the network sees (Tables 4 and 5)."""
     down_kernel: Literal[2, 3] = 3
@@ -191,6 +193,10 @@ def method(options: Options | None = None) -> Method:
             net = UNetSR(**common, rngs=rngs)  # type: ignore[arg-type]
         else:
             net = FusionSR(**common, fusion=o.fusion, rngs=rngs)  # type: ignore[arg-type]
+            if o.fusion == "se-residual" and o.residual == "zero":
+                for module in net.fusions:
+                    assert module.norm2.scale is not None
+                    module.norm2.scale[...] = jnp.zeros_like(module.norm2.scale[...])
         if o.start == "guided":  # begin at E: steps away from a random picture kill the ReLUs before it
             last = net.decoder1.convs.conv2
             assert last.bias is not None
