@@ -93,7 +93,7 @@ VARIANTS = {
     "guided-taau": Variant("guided TAAU", "guided-taau"),
     "rcan": Variant("RCAN 5x4x64", "rcan", {"groups": 5, "blocks": 4}),
     "nsrr": Variant("NSRR", "nsrr", {}),
-    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}),
+    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}, 1e-4),
     "fusion": Variant("fusion", "fusion-sr", PAPER),
     "fusion-guided": Variant("fusion, guided start", "fusion-sr", {}),
     "fusion-zero": Variant("fusion, residuals from 0", "fusion-sr", PAPER | {"residual": "zero"}),
