@@ -110,7 +110,9 @@ def test_a_table_has_the_papers_numbers_beside_ours():
     found = tables.document("table5", runs)
     lines = tables.markdown(found)
     assert "| docks | NSRR | 19.00 | 20.79 | -1.00 | 0.5000 | 0.7006 | 19.00 | 7 | 8 |" in lines
-    assert "| docks | fusion | 20.00 | 25.37 |  | 0.5000 | 0.8705 | 20.00 | 7 | 8 |" in lines
+    assert (
+        "| docks | fusion, residuals from 0 | 20.00 | 25.37 |  | 0.5000 | 0.8705 | 20.00 | 7 | 8 |" in lines
+    )
     assert "3 steps of 1 crops of 8 px from 1 clips" in lines[-1]
     assert "commit abc" in lines[-1]
 
@@ -137,10 +139,10 @@ def test_a_table_has_the_seeds_that_all_have():
     runs = {name: [made(name, 0), made(name, 1, 30.0)] for name in tables.TABLES["table5"].variants}
     runs["nsrr"] = runs["nsrr"][:1]
     found = tables.document("table5", runs)
-    assert found["seeds"] == {"depth-only": [0], "nsrr": [0], "fusion": [0]}
-    assert found["scenes"]["docks"]["fusion"]["measured"]["psnr"]["mean"] == 20
+    assert found["seeds"] == {"depth-only": [0], "nsrr": [0], "fusion-zero": [0]}
+    assert found["scenes"]["docks"]["fusion-zero"]["measured"]["psnr"]["mean"] == 20
     runs["nsrr"].append(made("nsrr", 1, 30.0))
-    assert tables.document("table5", runs)["scenes"]["docks"]["fusion"]["measured"]["psnr"]["mean"] == 25
+    assert tables.document("table5", runs)["scenes"]["docks"]["fusion-zero"]["measured"]["psnr"]["mean"] == 25
 
 
 def test_differences_are_seed_against_seed():
@@ -165,7 +167,7 @@ def test_learning_rates_are_those_that_were_best():
 
 def test_a_table_without_a_run_names_the_command():
     with pytest.raises(JaxsrError, match=r"no numbers of depth-only, nsrr.*study.py depth-only nsrr"):
-        tables.document("table5", {"fusion": [made("fusion")]})
+        tables.document("table5", {"fusion-zero": [made("fusion-zero")]})
 
 
 def test_the_page_keeps_what_is_around_a_table():

@@ -56,6 +56,9 @@ CLIPS = 3
 LOSS = {"ssim_weight": 1.0, "l1_weight": 1.0, "perceptual_weight": 0.0}
 PAPER = {"color": "display", "start": "nothing"}
 """The picture from colour and G-buffer alone, as published; the default corrects a guided upsampling."""
+ZERO = PAPER | {"residual": "zero"}
+"""The same, its residuals begun at 0: with so few steps the published beginning costs more than a decibel,
+which would hide what buffers are worth."""
 BUFFERS = fusion_sr.BUFFERS
 
 BUDGET = TrainConfig(
@@ -83,8 +86,8 @@ class Variant:
 
 
 def without(*names: str) -> dict[str, Any]:
-    """The fusion network of the paper that does not see these buffers."""
-    return PAPER | {"buffers": tuple(name for name in BUFFERS if name not in names)}
+    """The fusion network that does not see these buffers; see "fusion-zero" for why from 0."""
+    return ZERO | {"buffers": tuple(name for name in BUFFERS if name not in names)}
 
 
 VARIANTS = {
@@ -96,11 +99,11 @@ VARIANTS = {
     "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}, 1e-4),
     "fusion": Variant("fusion", "fusion-sr", PAPER),
     "fusion-guided": Variant("fusion, guided start", "fusion-sr", {}),
-    "fusion-zero": Variant("fusion, residuals from 0", "fusion-sr", PAPER | {"residual": "zero"}),
+    "fusion-zero": Variant("fusion, residuals from 0", "fusion-sr", ZERO),
     "concat": Variant("concat", "fusion-sr", PAPER | {"fusion": "concat"}),
     "add": Variant("add", "fusion-sr", PAPER | {"fusion": "add"}),
     "unet": Variant("single-branch U-Net", "fusion-sr", PAPER | {"architecture": "unet"}),
-    "depth-only": Variant("depth only", "fusion-sr", PAPER | {"buffers": ("depth",)}),
+    "depth-only": Variant("depth only", "fusion-sr", ZERO | {"buffers": ("depth",)}),
     "no-base-color": Variant("no base colour", "fusion-sr", without("base_color")),
     "no-normal": Variant("no normal", "fusion-sr", without("normal")),
     "no-depth": Variant("no depth", "fusion-sr", without("depth")),
