@@ -327,7 +327,7 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
     for name, rate in found["learning_rates"].items():
         rates.setdefault(rate, []).append(VARIANTS[name].label)
     few = len(rates) < 2
-    words = ", ".join(f"{rate:g}" + ("" if few else f" ({', '.join(of)})") for rate, of in rates.items())
+    words = ", ".join(f"{rate:g}" + ("" if few else f" ({'; '.join(of)})") for rate, of in rates.items())
     each = " or ".join(", ".join(map(str, s)) for s in sorted(seeds))
     lines += [
         "",
