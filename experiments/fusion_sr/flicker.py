@@ -44,9 +44,9 @@ from jaxsr.io.images import read_png, write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
 from jaxsr.ops import backward_warp  # noqa: E402
 
-CURRENT = ("bicubic", "rcan", "fusion", "fusion-guided")
+CURRENT = ("bicubic", "rcan", "fusion", "fusion-zero", "fusion-guided")
 HISTORY = ("taau", "guided-taau", "nsrr", "rrn")
-STRIP = ("taau", "nsrr", "rrn", "fusion")
+STRIP = ("taau", "nsrr", "rrn", "fusion-zero")
 TILE, CHANGE, HIDDEN = 12, 12 / 255, 0.1
 WINDOW = (108, 96)
 """Width and height of the crop in the strip: where most lit tiles are."""
