@@ -204,7 +204,7 @@ def test_the_page_has_the_numbers_of_flicker_and_timing(name):
         return
     found = json.loads(file.read_text())
     if name == "figure9":
-        lines = flicker.table(found["old_color"], found["tiles"])
+        lines = flicker.table(found["shares"], found["tiles"])
     elif name == "runtime":
         lines = timing.runtime_table(found["methods"], found["about"])
     else:
@@ -213,24 +213,30 @@ def test_the_page_has_the_numbers_of_flicker_and_timing(name):
     assert block(name)[: len(lines)] == lines
 
 
-def test_old_colour_is_seen_and_blur_is_not():
-    tile, grey = flicker.TILE, np.full((48, 48, 3), 0.5)
-    lit = grey.copy()
-    lit[:tile, : 2 * tile, 0] = 0.8  # a red lamp on two tiles
-    nowhere = np.zeros((48, 48), bool)
-    lamp = flicker.lamp(lit, grey, nowhere)
+def test_old_colour_is_told_from_an_average_and_blur_is_neither():
+    tile, grey, nowhere = flicker.TILE, np.full((48, 48, 3), 0.5), np.zeros((48, 48), bool)
+
+    def lit(*color):
+        image = grey.copy()
+        image[:tile, : 2 * tile] = color  # a lamp on two tiles
+        return image
+
+    red, blue, mean = lit(0.8, 0.5, 0.5), lit(0.4, 0.5, 0.9), lit(0.6, 0.6, 0.6)
+    lamp = flicker.lamp(red, blue, nowhere)
     assert lamp.lit.sum() == 2
     assert lamp.lit[0, :2].all()
-    assert flicker.old_color(lit, lamp) == 0
-    assert flicker.old_color(grey, lamp) == 1
-    assert flicker.old_color(0.75 * lit + 0.25 * grey, lamp) == pytest.approx(0.25)
-    assert flicker.old_color(lit + 0.1 * np.resize([1, -1], (48, 1)), lamp) == pytest.approx(0, abs=1e-4)
-    assert flicker.old_color(lit + np.array([0, 0.1, 0.1]), lamp) == pytest.approx(
-        0
-    )  # wrong, but not the old colour
+
+    def shares(image, lamp=lamp):
+        return flicker.shares([image], [lamp], flicker.tile_means(mean))
+
+    assert shares(red) == (0, 0)
+    assert shares(blue) == pytest.approx((1, 0), abs=1e-4)
+    assert shares(mean) == pytest.approx((0, 1), abs=1e-4)
+    assert shares(0.7 * red + 0.2 * blue + 0.1 * mean) == pytest.approx((0.2, 0.1), abs=1e-4)
+    assert shares(red + 0.1 * np.resize([1, -1], (48, 1))) == pytest.approx((0, 0), abs=1e-4)
     hidden = nowhere.copy()
     hidden[: tile // 2] = True
-    assert flicker.old_color(grey, flicker.lamp(lit, grey, hidden)) is None
+    assert shares(blue, flicker.lamp(red, blue, hidden)) is None
 
 
 def test_a_clip_without_a_lamp_is_an_error(tmp_path):

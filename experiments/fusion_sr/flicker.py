@@ -6,12 +6,15 @@ Reads what the methods of `study.py` made of the bunker's test clip, all of its 
 runs (seed 0). For each frame t and tile, c is the mean colour of the truth, p that of the previous truth
 warped to it by the motion: what history holds there. Tiles count where |p - c| is more than `CHANGE` (RMS
 over channels), that is where the lamp shines and has changed; those that are disoccluded by more than a tenth
-(`HIDDEN`) do not. With o the mean colour that a method made,
+(`HIDDEN`) do not. With o the mean
+colour that a method made and m the mean of the truth's over the whole clip, least squares over the tiles of a
+frame give
 
-    old colour = sum (o - c).(p - c) / sum (p - c).(p - c)      over the tiles of a frame
+    o - c = old (p - c) + average (m - c) + rest
 
-is 0 where the colour is that of this frame, 1 where it is still that of the frame before. Blur within a tile
-and errors that have nothing to do with the old colour do not count. Display-referred.
+`old` is 0 where no colour comes from the frame before, 1 where all of it does; `average` is how far a method
+washes the lamp out, as a network does that has not learned its colours. Blur within a tile and other errors
+count as neither. Display-referred.
 
 Writes experiments/results/fusion_sr/flicker.json and .md, docs/images/fusion_flicker_strip.png, a row a
 method and a column a frame, docs/images/fusion_flicker.png, the curves, and its part of
@@ -21,6 +24,7 @@ docs/results_fusion_sr.md.
 import json
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -46,15 +50,16 @@ from jaxsr.ops import backward_warp  # noqa: E402
 
 CURRENT = ("bicubic", "rcan", "fusion", "fusion-zero", "fusion-guided")
 HISTORY = ("taau", "guided-taau", "nsrr", "rrn")
-STRIP = ("taau", "nsrr", "rrn", "fusion-zero")
-TILE, CHANGE, HIDDEN = 12, 12 / 255, 0.1
+STRIP = ("taau", "nsrr", "rrn", "fusion-zero", "fusion-guided")
+TILE, CHANGE, HIDDEN, LAST = 12, 12 / 255, 0.1, 4
 WINDOW = (108, 96)
 """Width and height of the crop in the strip: where most lit tiles are."""
 FRAMES = (2, 3, 4, 5, 6, 7)
 """Positions in the clip of the columns."""
 ZOOM, LABEL = 2, 90
 
-Curves = dict[str, list[float | None]]
+Curves = dict[str, list["Shares | None"]]
+"""By method: of each frame but the first, and of the last four together."""
 
 
 def tile_means(image: np.ndarray) -> np.ndarray:
@@ -88,12 +93,31 @@ def lamp(truth: np.ndarray, before: np.ndarray, hidden: np.ndarray) -> Lamp:
     return Lamp(color, old, changed & (tile_means(hidden[..., None])[..., 0] < HIDDEN))
 
 
-def old_color(image: np.ndarray, lamp: Lamp) -> float | None:
-    """The share of the old colour in a frame; None where no tile counts."""
-    if not lamp.lit.any():
+class Shares(NamedTuple):
+    """Of the colour of the lamp in what a method made; see above."""
+
+    old: float
+    average: float
+
+
+def shares(images: Sequence[np.ndarray], found: Sequence[Lamp], mean: np.ndarray) -> Shares | None:
+    """The shares over frames; None where no tile counts.
+
+    Args:
+        images: display-referred.
+        found: what the lamp does to these frames.
+        mean: m, by tile.
+    """
+    made, old, average = [], [], []
+    for image, one in zip(images, found, strict=True):
+        made.append((tile_means(image) - one.color)[one.lit].ravel())
+        old.append((one.old - one.color)[one.lit].ravel())
+        average.append((mean - one.color)[one.lit].ravel())
+    if not sum(map(len, made)):
         return None
-    made, change = (tile_means(image) - lamp.color)[lamp.lit], (lamp.old - lamp.color)[lamp.lit]
-    return round(float(np.sum(made * change) / np.sum(change**2)), 4)
+    columns = np.stack([np.concatenate(old), np.concatenate(average)], -1)
+    solution = np.linalg.lstsq(columns, np.concatenate(made))[0]
+    return Shares(*(round(float(v), 4) for v in solution))
 
 
 def lamps(sequence: FrameSequence) -> list[Lamp]:
@@ -161,7 +185,7 @@ def strip(rows: dict[str, np.ndarray], found: list[Lamp]) -> np.ndarray:
 
 
 def chart(curves: Curves, file: Path) -> None:
-    """The share over time: methods of the current frame dashed."""
+    """The share of the old colour over time: methods of the current frame dashed."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -170,32 +194,30 @@ def chart(curves: Curves, file: Path) -> None:
     axes = figure.subplots()
     for name, curve in curves.items():
         style = "--" if name in CURRENT else "-"
-        shown = [np.nan if v is None else 100 * v for v in curve]
-        axes.plot(range(2, len(curve) + 2), shown, style, marker=".", label=VARIANTS[name].label)
+        old = [np.nan if one is None else 100 * one[0] for one in curve[:-1]]
+        axes.plot(range(2, len(old) + 2), old, style, marker=".", label=VARIANTS[name].label)
     axes.set_xlabel("frame")
-    axes.set_ylabel("old colour left (%)")
+    axes.set_ylabel("old colour (%)")
     axes.grid(alpha=0.3)
     figure.legend(loc="outside right upper", title="dashed: current frame alone")
     with atomic_path(file) as temporary:
         figure.savefig(temporary, format="png", dpi=100)
 
 
-def table(curves: Curves, tiles: list[int]) -> list[str]:
-    """A row a method: the share of each frame, and the mean over the last four."""
+def table(curves: Curves, tiles: Sequence[int]) -> list[str]:
+    """A row a method: the old colour of each frame, and both shares over the last four together."""
+    frames = " | ".join(f"frame {i + 2}" for i in range(len(tiles)))
     lines = [
-        "| method | sees | "
-        + " | ".join(f"frame {i + 2}" for i in range(len(tiles)))
-        + " | mean of the last 4 |",
-        "|---|---|" + "---:|" * (len(tiles) + 1),
+        f"| method | sees | {frames} | last {LAST}: old | average |",
+        "|---|---|" + "---:|" * (len(tiles) + 2),
     ]
     for name, curve in curves.items():
         sees = "current frame" if name in CURRENT else "history"
-        known = [v for v in curve[-4:] if v is not None]
-        cells = [
-            "–" if v is None else f"{100 * v:.1f} %" for v in (*curve, np.mean(known) if known else None)
-        ]
+        *each, together = curve
+        values = [None if one is None else one[0] for one in each] + list(together or (None, None))
+        cells = ["–" if v is None else f"{100 * v:.0f} %" for v in values]
         lines.append(f"| {VARIANTS[name].label} | {sees} | {' | '.join(cells)} |")
-    lines.append(f"| tiles that changed | | {' | '.join(map(str, tiles))} | |")
+    lines.append(f"| tiles that changed | | {' | '.join(map(str, tiles))} | | |")
     return lines
 
 
@@ -213,10 +235,11 @@ def main(runs: Path = RUNS) -> None:
         truths = np.stack([display(sequence.truth(i), sequence.exposure) for i in range(count)])
         inputs = [display(sequence.frame(i, SCALE).color_linear, sequence.exposure) for i in range(count)]
     made = {name: frames_of(name, runs, sequence.name, count) for name in (*CURRENT, *HISTORY)}
-    curves = {
-        name: [old_color(frame, one) for frame, one in zip(frames[1:], found, strict=True)]
-        for name, frames in made.items()
-    }
+    mean = np.mean([tile_means(truth) for truth in truths], 0)
+    curves: Curves = {}
+    for name, (_, *frames) in made.items():
+        curves[name] = [shares([frame], [one], mean) for frame, one in zip(frames, found, strict=True)]
+        curves[name].append(shares(frames[-LAST:], found[-LAST:], mean))
     tiles = [int(one.lit.sum()) for one in found]
     sources = {name: json.loads(results_file(name, 0).read_text(encoding="utf-8")) for name in made}
     numbers: dict[str, Any] = {
@@ -224,7 +247,7 @@ def main(runs: Path = RUNS) -> None:
         "tile_px": TILE,
         "change": CHANGE,
         "tiles": tiles,
-        "old_color": curves,
+        "shares": curves,
         "trained_at": {name: run["trained"]["commit"] for name, run in sources.items() if "trained" in run},
         "measured": description(commit=commit(), scale=SCALE, seed=0),
     }
@@ -239,7 +262,7 @@ def main(runs: Path = RUNS) -> None:
         *lines,
         "",
         f"Share of the previous frame's colour where the lamp has changed; tiles of {TILE}x{TILE} px; "
-        f"seed 0; commit {numbers['measured']['commit']}.",
+        f"networks of seed 0; commit {numbers['measured']['commit']}.",
         "",
         "![A row a method, a column a frame](images/fusion_flicker_strip.png)",
         "",
