@@ -6,8 +6,8 @@ Reads what the methods of `study.py` made of the bunker's test clip, all of its 
 runs (seed 0). For each frame t and tile, c is the mean colour of the truth, p that of the previous truth
 warped to it by the motion: what history holds there. Tiles count where |p - c| is more than `CHANGE` (RMS
 over channels), that is where the lamp shines and has changed; those that are disoccluded by more than a tenth
-(`HIDDEN`) do not. With o the mean colour that a method made and m the mean of the truth's over the whole clip,
-least squares over the tiles of a frame give
+(`HIDDEN`) do not. With o the mean colour that a method made and m the mean of the truth's over the whole
+clip, least squares over the tiles of a frame give
 
     o - c = old (p - c) + average (m - c) + rest
 
