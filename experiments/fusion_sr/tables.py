@@ -57,6 +57,8 @@ class Table:
     paper: Paper = field(default_factory=dict)
     pictures: tuple[str, ...] = ()
     """Scenes to draw crops of."""
+    not_pictured: tuple[str, ...] = ()
+    """Left out of the crops, which become too small otherwise."""
     reference: str = "fusion"
     """From whose PSNR that of the others is taken."""
 
@@ -86,6 +88,7 @@ TABLES = {
             },
         },
         ("bunker", "forest", "docks"),
+        ("bicubic", "guided-taau", "fusion"),
     ),
     "table3": Table(
         "Table 3: how features meet",
@@ -119,7 +122,7 @@ TABLES = {
         reference="fusion-zero",
     ),
     "figure11": Table(
-        "Figure 11: one branch", ("unet", "fusion", "fusion-zero"), {}, ("docks",), "fusion-zero"
+        "Figure 11: one branch", ("unet", "fusion", "fusion-zero"), {}, ("docks",), reference="fusion-zero"
     ),
 }
 
@@ -373,14 +376,13 @@ def chart(found: Mapping[str, Any], file: Path) -> None:
 def crops(name: str, scene: str, runs: Path) -> Path | None:
     """Crops of what the variants of a table made of one frame; None where the frames are not there."""
     table = TABLES[name]
-    made = {
-        v: sorted((runs / results_file(v, 0).stem / "frames").glob(f"{scene}-*/png")) for v in table.variants
-    }
+    pictured = [variant for variant in table.variants if variant not in table.not_pictured]
+    made = {v: sorted((runs / results_file(v, 0).stem / "frames").glob(f"{scene}-*/png")) for v in pictured}
     files = {v: folders[0] / f"{FRAME:04d}.png" for v, folders in made.items() if folders}
-    if len(files) < len(table.variants) or not all(file.is_file() for file in files.values()):
+    if len(files) < len(pictured) or not all(file.is_file() for file in files.values()):
         return None
     truth, given = _truth(scene)
-    metrics = {v: json.loads(results_file(v, 0, RESULTS).read_text(encoding="utf-8")) for v in table.variants}
+    metrics = {v: json.loads(results_file(v, 0, RESULTS).read_text(encoding="utf-8")) for v in pictured}
     columns = [Shown("input", given, {})]
     for v, file in files.items():
         here = metrics[v]["scenes"][scene]
