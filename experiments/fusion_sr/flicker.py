@@ -150,7 +150,7 @@ def frames_of(name: str, runs: Path, clip: str, count: int) -> np.ndarray:
             where=folder,
             expected=f"{count} frames",
             found=len(files),
-            fix=f"python experiments/fusion_sr/study.py {name} --seeds 0 --again",
+            fix=f"python experiments/fusion_sr/study.py {name} --seeds 0 --again --runs {runs}",
         )
     return np.stack([read_png(file) for file in files])
 

@@ -10,7 +10,7 @@ made again (`--again`), and a training goes on where it was stopped. `tables.py`
 The same for all: windows of five frames, their order, crops and flips, number of steps, schedule, clipping,
 loss (1 - SSIM + L1 on display-referred colour), exposure, tone map, jittered input. The loss is that of the
 last frame of a window, and for RRN, which is trained through its past, the mean over all five: five times the
-pixels. The learning rate is the best of two or three (`rates.py`). One network for all scenes.
+pixels. The learning rate is the better of two (`rates.py`). One network for all scenes.
 
 Test frames: the last four of each clip of the sample; the four before them are shown to every method and not
 measured, as many as NSRR looks back.

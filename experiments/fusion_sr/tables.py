@@ -307,7 +307,7 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
     for key in keys:
         unit = f" ({METRICS[key].unit})" if METRICS[key].unit else ""
         head += [METRICS[key].label + unit, *(["paper"] if key in ("psnr", "ssim") else [])]
-        head += [f"less {VARIANTS[found['reference']].label}"] if key == "psnr" else []
+        head += [f"PSNR − {VARIANTS[found['reference']].label}"] if key == "psnr" else []
     lines = [
         f"| scene | method | {' | '.join(head)} | weights | multiply-adds / px |",
         "|---|---|" + "---:|" * (len(head) + 2),
