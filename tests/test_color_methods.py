@@ -128,6 +128,15 @@ def test_a_network_that_is_bilinear_gives_what_bilinear_gives():
 # The step.
 
 
+def assert_same(found, expected):
+    """Of two runs of a network: threads share out its sums as they are free, so that rounding differs.
+
+    Linear colour is steep where the display is nearly white, hence the tolerance; NaN, or another input,
+    shows by far.
+    """
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-4)
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_streaming_equals_scan(name):
     frames = clip()
@@ -160,7 +169,7 @@ def test_an_extrapolated_frame_is_the_last_picture_warped(name):
     frames = clip()
     frames[3] = frames[3]._replace(color_linear=jnp.full_like(frames[3].color_linear, jnp.nan))
     images, _ = stream(name, frames)
-    np.testing.assert_array_equal(np.stack(images), np.stack(streamed(name)))  # the colour was not seen
+    assert_same(np.stack(images), np.stack(streamed(name)))  # the colour was not seen
     expected = backward_warp(images[2], frames[3].hr.motion_px)
     np.testing.assert_allclose(images[3], expected, rtol=1e-4, atol=1e-5)
 
@@ -171,7 +180,7 @@ def test_a_cut_drops_the_history(name):
     broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
     after = [frames[2]._replace(cut=jnp.asarray(True)), frames[3]]
     alone, _ = stream(name, after)
-    np.testing.assert_array_equal(stream(name, [broken, frames[1], *after])[0][2:], alone)
+    assert_same(stream(name, [broken, frames[1], *after])[0][2:], alone)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -218,7 +227,7 @@ def test_it_sees_colour_and_motion_alone(name):
     _, image = step_of(name)(
         state_of(name), method.init(frame), frame._replace(lr=bare(frame.lr), hr=bare(frame.hr))
     )
-    np.testing.assert_array_equal(image, streamed(name)[0])
+    assert_same(image, streamed(name)[0])
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -241,7 +250,7 @@ def test_rrn_remembers():
     other = frames[0]._replace(color_linear=0.5 * frames[0].color_linear)
     first, second = stream("rrn", frames[:3])[0], stream("rrn", [other, *frames[1:3]])[0]
     assert np.abs(first[2] - second[2]).max() > 1e-4
-    np.testing.assert_array_equal(*(stream("rcan", [f, *frames[1:3]])[0][2] for f in (frames[0], other)))
+    assert_same(*(stream("rcan", [f, *frames[1:3]])[0][2] for f in (frames[0], other)))
 
 
 def test_rrn_feeds_back_what_it_made():
@@ -265,7 +274,7 @@ def test_rrn_s_past_waits_while_nothing_is_rendered():
     frames = clip()
     _, before = stream("rrn", frames[:3])
     _, after = stream("rrn", frames[:4])
-    jax.tree.map(np.testing.assert_array_equal, before.past, after.past)
+    jax.tree.map(assert_same, before.past, after.past)
 
 
 def test_a_broken_pixel_is_forgotten():
