@@ -26,7 +26,7 @@ import tyro  # noqa: E402
 from tyro.conf import Positional  # noqa: E402
 
 from experiments.fusion_sr.figures import Shown, sheet  # noqa: E402
-from experiments.fusion_sr.study import RESULTS, RUNS, VARIANTS, WARM_UP, results_file  # noqa: E402
+from experiments.fusion_sr.study import RESULTS, RUNS, SCALE, VARIANTS, WARM_UP, results_file  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.measuring import display  # noqa: E402
 from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
@@ -391,20 +391,20 @@ def crops(name: str, scene: str, runs: Path) -> Path | None:
         columns.append(Shown(VARIANTS[v].label, read_png(file), values))
     columns.append(Shown("truth", truth, {}))
     target = IMAGES / f"fusion_{name}_{scene}.png"
-    write_png(target, sheet(f"{scene}, frame {FRAME}, x4", columns))
+    write_png(target, sheet(f"{scene}, frame {FRAME}, x{SCALE}", columns))
     return target
 
 
 def _truth(scene: str) -> tuple[Any, Any]:
     """Display-referred truth and enlarged input of the frame in the pictures."""
     with tempfile.TemporaryDirectory() as folder:
-        (clip,) = unpack_sample(Path(folder), "test", (scene,), scale=4)
+        (clip,) = unpack_sample(Path(folder), "test", (scene,), scale=SCALE)
         sequence = FrameSequence.open(clip)
         position = [info.index for info in sequence.infos].index(FRAME)
         assert position >= WARM_UP
         truth = display(sequence.truth(position), sequence.exposure)
-        given = display(sequence.frame(position, 4).color_linear, sequence.exposure)
-    return truth, given.repeat(4, 0).repeat(4, 1)
+        given = display(sequence.frame(position, SCALE).color_linear, sequence.exposure)
+    return truth, given.repeat(SCALE, 0).repeat(SCALE, 1)
 
 
 def on_page(page: str, name: str, block: list[str]) -> str:

@@ -1,11 +1,11 @@
 """Where the time goes: each method at 480x270 -> 1920x1080, and what Blender takes to render (Table 2).
 
     python experiments/fusion_sr/timing.py methods [--rounds 5]
-    python experiments/fusion_sr/timing.py render [--blender PATH] [--samples 16]
+    python experiments/fusion_sr/timing.py render [--blender-path PATH] [--samples 16]
 
 `methods` times a step of every method of Table 1 on the analytic scene, the methods in turn, round after
 round (median, quartiles; compilation apart). Times do not depend on weights: these are random, of the sizes
-of `study.py`, and RCAN and RRN of the published sizes as well (RCAN in one round: it takes a minute).
+of `study.py`, and RCAN and RRN of the published sizes as well (RCAN in one round: it takes half a minute).
 
 `render` renders one frame of each test clip: HR and LR colour with so many samples, and the G-buffer, all on
 the CPU; scenes that have numbers are not rendered again (`--again`). The seconds are CPU seconds of Blender
