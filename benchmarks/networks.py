@@ -28,15 +28,15 @@ from flax import nnx
 
 from benchmarks import _common
 from benchmarks._common import Inputs, Prepared, Variant
-from jaxsr import perceptual
 from jaxsr.frames import Camera, Frame, GBuffer, Window
-from jaxsr.io.weights import into
 from jaxsr.methods import Method, fusion_sr
 from jaxsr.nets import FusionSR
-from jaxsr.nets.published import translate
+from jaxsr.nets import vgg as perceptual
 from jaxsr.training import TrainConfig
 from jaxsr.training.state import begin
 from jaxsr.training.step import make_step, shardings
+from jaxsr.weights.file import into
+from jaxsr.weights.names import translate
 
 SCALE, BATCH, CHANNELS = 4, 8, 9
 

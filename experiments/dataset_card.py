@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import atomic_path
+from jaxsr.files import atomic_path
 from jaxsr.io.images import write_png
 from jaxsr.io.sequence import Sequence
 from jaxsr.ops.color import to_display

@@ -20,15 +20,15 @@ import numpy as np
 import tyro
 from PIL import Image, ImageDraw, ImageFont
 
+from jaxsr.data.sample import unpack_sample
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description, run_demo
-from jaxsr.evaluation.embedding import ImageOrPath, to_bytes
-from jaxsr.evaluation.progress import bars
-from jaxsr.evaluation.sample import unpack_sample
-from jaxsr.evaluation.sections import Section
-from jaxsr.evaluation.tables import as_json, best, cell, duration, header, summary
-from jaxsr.io.exr import atomic_path
+from jaxsr.files import atomic_path
 from jaxsr.io.images import write_png
+from jaxsr.progress import bars
+from jaxsr.report.embedding import ImageOrPath, to_bytes
+from jaxsr.report.results import SequenceResult
+from jaxsr.report.tables import as_json, best, cell, duration, header, summary
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
@@ -56,11 +56,11 @@ class Config:
     """The frame shown in the pictures; even frames are extrapolated."""
 
 
-def task_of(section: Section) -> str:
+def task_of(section: SequenceResult) -> str:
     return "extrapolation" if any(section.extrapolated) else "super-resolution"
 
 
-def table(sections: list[Section], task: str) -> list[str]:
+def table(sections: list[SequenceResult], task: str) -> list[str]:
     """One table a task: every metric of every method, a block of lines for each scene."""
     chosen = [s for s in sections if task_of(s) == task]
     keys = chosen[0].metric_keys()
@@ -141,7 +141,7 @@ def busiest(truth: np.ndarray, rivals: list[np.ndarray]) -> tuple[int, int]:
     return int(x), int(y)
 
 
-def strip(section: Section, frame: int) -> np.ndarray:
+def strip(section: SequenceResult, frame: int) -> np.ndarray:
     """The truth with the crop marked, then the crop of the input, each method and the truth, enlarged."""
     i = list(section.frames).index(frame)
     truth = pixels(section.truths[i])
@@ -174,7 +174,7 @@ def strip(section: Section, frame: int) -> np.ndarray:
     return np.asarray(sheet)
 
 
-def picture(sections: list[Section], task: str, frame: int) -> np.ndarray:
+def picture(sections: list[SequenceResult], task: str, frame: int) -> np.ndarray:
     rows = [strip(s, frame) for s in sections if task_of(s) == task]
     width = max(r.shape[1] for r in rows)
     return np.concatenate(
@@ -184,7 +184,7 @@ def picture(sections: list[Section], task: str, frame: int) -> np.ndarray:
 
 def main(config: Config) -> None:
     start = time.time()
-    sections: list[Section] = []
+    sections: list[SequenceResult] = []
     with tempfile.TemporaryDirectory() as folder, bars() as progress:
         for scale in config.scales:
             paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)

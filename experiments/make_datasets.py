@@ -45,12 +45,13 @@ from rich.progress import (  # noqa: E402
 
 from experiments import dataset_card  # noqa: E402
 from experiments.provenance import commit  # noqa: E402
+from jaxsr.blender import render as blender  # noqa: E402
+from jaxsr.blender.convert import convert_color  # noqa: E402
+from jaxsr.blender.process import BlenderProcess, find_blender  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
-from jaxsr.io import blender  # noqa: E402
+from jaxsr.files import atomic_path  # noqa: E402
 from jaxsr.io.archive import pack, read_manifest, unpack_sequence, verify  # noqa: E402
-from jaxsr.io.blender_convert import convert_color  # noqa: E402
-from jaxsr.io.blender_process import BlenderProcess, find_blender  # noqa: E402
-from jaxsr.io.exr import atomic_path, read_exr  # noqa: E402
+from jaxsr.io.exr import read_exr  # noqa: E402
 from jaxsr.io.sequence import Sequence  # noqa: E402
 from jaxsr.ops.color import to_display  # noqa: E402
 

@@ -33,15 +33,15 @@ import numpy as np
 import tyro
 from rich.progress import track
 
+from jaxsr.data.sample import unpack_sample
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description
-from jaxsr.evaluation.run import observed
-from jaxsr.evaluation.sample import unpack_sample
+from jaxsr.files import atomic_path
 from jaxsr.frames import Frame
-from jaxsr.io.exr import atomic_path
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.methods import METHODS, Method, guided, guided_taau, taau
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
+from jaxsr.runtime.schedule import observed
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

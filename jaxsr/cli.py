@@ -14,7 +14,7 @@ import tyro
 from tyro.conf import Positional
 
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.progress import bars
+from jaxsr.progress import bars
 
 app = tyro.extras.SubcommandApp()
 
@@ -36,9 +36,9 @@ def demo(
     """
     from rich.console import Console
 
+    from jaxsr.data.sample import unpack_sample
     from jaxsr.evaluation.demo import run_demo
-    from jaxsr.evaluation.sample import unpack_sample
-    from jaxsr.evaluation.tables import rich_tables
+    from jaxsr.report.tables import rich_tables
 
     with bars() as progress:
         sequences = unpack_sample(out / "sample", "test", scenes, scale, progress)
@@ -63,8 +63,8 @@ def inspect(
         sequence: folder of the sequence.
         json: print the findings for machines instead of people.
     """
-    from jaxsr.evaluation.inspect import inspect as inspect_sequence
-    from jaxsr.evaluation.inspect import print_report
+    from jaxsr.inspection.inspect import inspect as inspect_sequence
+    from jaxsr.inspection.inspect import print_report
     from jaxsr.io.sequence import Sequence
     from jaxsr.methods import METHODS
 
@@ -103,7 +103,7 @@ def compare(
     from jaxsr.evaluation.compare import compare as compare_folders
     from jaxsr.evaluation.demo import description
     from jaxsr.evaluation.measuring import metrics_with
-    from jaxsr.evaluation.tables import rich_tables
+    from jaxsr.report.tables import rich_tables
 
     with bars() as progress:
         section = compare_folders(
@@ -139,9 +139,9 @@ def upscale(
         every: every n-th frame counts as rendered; the others are extrapolated.
         out: folder for `exr/` (linear) and `png/` (as shown).
     """
-    from jaxsr.evaluation.run import find_method
-    from jaxsr.evaluation.upscale import upscale as upscale_sequence
+    from jaxsr.evaluation.running import upscale as upscale_sequence
     from jaxsr.io.sequence import Sequence
+    from jaxsr.runtime.load import find_method
 
     opened = Sequence.open(sequence)
     scale = scale or max(opened.scales, default=1)
@@ -187,8 +187,8 @@ def evaluate(
     from jaxsr.evaluation.demo import description
     from jaxsr.evaluation.evaluate import evaluate as evaluate_methods
     from jaxsr.evaluation.measuring import metrics_with
-    from jaxsr.evaluation.tables import rich_tables
-    from jaxsr.evaluation.upscale import Settings
+    from jaxsr.evaluation.running import Settings
+    from jaxsr.report.tables import rich_tables
 
     settings = Settings(scale, every, warmup, metrics_with(lpips))
     with bars() as progress:
@@ -240,8 +240,8 @@ def render(
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-    from jaxsr.io.blender import Progress as RenderProgress
-    from jaxsr.io.blender import render as render_scene
+    from jaxsr.blender.render import Progress as RenderProgress
+    from jaxsr.blender.render import render as render_scene
 
     bounds = _frame_range(frames)
     columns = (
@@ -298,7 +298,7 @@ def convert_weights(
         buffers: fusion-sr's G-buffer channels, in order, where it has not all of them in the paper's order.
         half: store float16.
     """
-    from jaxsr.convert import convert_published
+    from jaxsr.weights.convert import convert_published
 
     header = convert_published(source, out, method, scale=scale, buffers=buffers or None, half=half)
     told = ", ".join(f"{name} {value}" for name, value in header["arguments"].items())

@@ -5,7 +5,7 @@ LPIPS, VGG) want display-referred images in [0, 1], though a prediction may leav
 take any. Gradients are finite everywhere, also where both images are identical or constant: every root and
 division has a constant in it that keeps it from zero.
 
-`lpips` is that of `jaxsr.perceptual`; it and `vgg_l1` need the extra `perceptual`.
+`lpips` is that of `jaxsr.nets.vgg`; it and `vgg_l1` need the extra `perceptual`.
 """
 
 import functools
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.perceptual import Params, features, lpips
+from jaxsr.nets.vgg import Params, features, lpips
 
 __all__ = [
     "SSIM_SIGMA",
@@ -195,7 +195,7 @@ def vgg_l1(
     Features are as the network makes them, not normalised. No gradient reaches the target.
 
     Raises:
-        JaxsrError: as for `jaxsr.perceptual.lpips`.
+        JaxsrError: as for `jaxsr.nets.vgg.lpips`.
     """
     of_target = jax.lax.stop_gradient(features(target, "vgg", params))
     of_pred = features(pred, "vgg", params)

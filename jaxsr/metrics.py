@@ -27,9 +27,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxsr import perceptual
 from jaxsr.errors import JaxsrError
 from jaxsr.losses import SSIM_WINDOW, gaussian_window
+from jaxsr.nets import vgg as perceptual
 
 Image: TypeAlias = Float[Array | np.ndarray, "h w 3"]
 Mask: TypeAlias = Bool[Array | np.ndarray, "h w"]
@@ -200,7 +200,7 @@ def _lpips_maps(image: Array, truth: Array, params: perceptual.Params) -> tuple[
 def lpips(image: Image, truth: Image, mask: Mask | None = None) -> float:
     """LPIPS v0.1 over VGG-16 (Zhang et al. 2018): 0 for identical images, lower is better.
 
-    Over a mask it is the mean of `jaxsr.perceptual.lpips_map`. Compiled once a size.
+    Over a mask it is the mean of `jaxsr.nets.vgg.lpips_map`. Compiled once a size.
 
     Raises:
         JaxsrError: as for `psnr`, images below 16x16, and where the extra `perceptual` is not installed.

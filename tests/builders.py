@@ -9,9 +9,9 @@ from flax import nnx
 
 from jaxsr.data import analytic
 from jaxsr.io.sequence import Sequence
-from jaxsr.io.weights import save_weights
 from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter
 from jaxsr.methods import build
+from jaxsr.weights.file import save_weights
 from tests.networks import SMALL
 
 Layers = dict[str, np.ndarray]

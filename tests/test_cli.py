@@ -196,7 +196,7 @@ def test_upscale_arguments(capsys, sequence, tmp_path, arguments, expected):
 )
 def test_evaluate_arguments(capsys, sequence, tmp_path, monkeypatch, arguments, expected):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("jaxsr.evaluation.run.weights_folder", lambda: tmp_path / "none")
+    monkeypatch.setattr("jaxsr.runtime.load.weights_folder", lambda: tmp_path / "none")
     (tmp_path / "text.safetensors").write_text("these are no weights")
     command = ("evaluate", sequence.path, "--scale", "2", "-o", tmp_path / "out", *arguments)
     assert expected in error_line(capsys, *command)
@@ -208,7 +208,7 @@ def test_evaluate_wants_sequences(capsys, tmp_path):
 
 
 def test_upscale_without_weights(capsys, sequence, tmp_path, monkeypatch):
-    monkeypatch.setattr("jaxsr.evaluation.run.weights_folder", lambda: tmp_path / "none")
+    monkeypatch.setattr("jaxsr.runtime.load.weights_folder", lambda: tmp_path / "none")
     line = error_line(capsys, "upscale", sequence.path, "--method", "fusion-sr", "-o", tmp_path / "out")
     assert "no weights of 'fusion-sr' for scale 2; found no weights of it in the package" in line
     assert not (tmp_path / "out").exists()
@@ -281,6 +281,6 @@ def test_render_errors(capsys, tmp_path, monkeypatch):
 def test_demo_errors(capsys, tmp_path, monkeypatch):
     assert "no scene 'moon'" in error_line(capsys, "demo", "-o", tmp_path, "--scenes", "moon")
     assert "scale 3 is not available" in error_line(capsys, "demo", "-o", tmp_path / "d", "--scale", "3")
-    monkeypatch.setattr("jaxsr.evaluation.sample.sample_folder", lambda: tmp_path / "none")
+    monkeypatch.setattr("jaxsr.data.sample.sample_folder", lambda: tmp_path / "none")
     assert "sample is missing" in error_line(capsys, "demo", "-o", tmp_path / "d")
     assert not (tmp_path / "d").exists()

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from experiments.demo_results import BEGIN, END, picture, readme_block
-from jaxsr.evaluation.sections import Section, Track
 from jaxsr.io.images import write_png
+from jaxsr.report.results import MethodResult, SequenceResult
 
 ROOT = Path(__file__).resolve().parent.parent
 README = (ROOT / "README.md").read_text()
@@ -54,9 +54,11 @@ def test_pictures_of_frames_in_memory_and_on_disk_are_alike(tmp_path):
     made[20:60, 40:104] = 0
 
     def section(convert):
-        tracks = [Track(name, [convert(name, image)], {"psnr": [20.0]}) for name, image in images.items()]
+        tracks = [
+            MethodResult(name, [convert(name, image)], {"psnr": [20.0]}) for name, image in images.items()
+        ]
         truths, inputs = [convert("truth", truth)], [convert("input", low)]
-        return Section(
+        return SequenceResult(
             "a",
             [6],
             truths,

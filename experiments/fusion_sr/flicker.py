@@ -37,11 +37,11 @@ from PIL import Image, ImageDraw, ImageFont  # noqa: E402
 from experiments.fusion_sr.study import RESULTS, RUNS, SCALE, VARIANTS, results_file  # noqa: E402
 from experiments.fusion_sr.tables import IMAGES, PAGE, on_page, write  # noqa: E402
 from experiments.provenance import commit  # noqa: E402
+from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
 from jaxsr.evaluation.measuring import display  # noqa: E402
 from jaxsr.evaluation.regions import disocclusions  # noqa: E402
-from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.images import read_png, write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402

@@ -3,9 +3,9 @@
     python experiments/fusion_sr/release.py [NAME ...] [--runs DIR]
 
 For each run of `train_released.py` that has ended: store its weights as float16 in
-`jaxsr/weights/NAME.safetensors`, measure that file and its rivals on the test frames of the sample, and write
-`docs/models/NAME.md` with data, budget, metrics and limits, and `experiments/results/NAME.json` with every
-number of every frame.
+`jaxsr/weights/released/NAME.safetensors`, measure that file and its rivals on the test frames of the
+sample, and write `docs/models/NAME.md` with data, budget, metrics and limits, and
+`experiments/results/NAME.json` with every number of every frame.
 """
 
 import json
@@ -24,20 +24,20 @@ from tyro.conf import Positional  # noqa: E402
 
 from experiments.fusion_sr.train_released import Run, chosen  # noqa: E402
 from experiments.provenance import commit  # noqa: E402
+from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
 from jaxsr.evaluation.evaluate import evaluate  # noqa: E402
-from jaxsr.evaluation.progress import bars  # noqa: E402
-from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
-from jaxsr.evaluation.sections import Section  # noqa: E402
-from jaxsr.evaluation.tables import as_json, cell, header, summary  # noqa: E402
-from jaxsr.evaluation.upscale import Settings  # noqa: E402
+from jaxsr.evaluation.running import Settings  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
-from jaxsr.io.weights import load_weights, save_weights  # noqa: E402
+from jaxsr.progress import bars  # noqa: E402
+from jaxsr.report.results import SequenceResult  # noqa: E402
+from jaxsr.report.tables import as_json, cell, header, summary  # noqa: E402
+from jaxsr.weights.file import load_weights, save_weights  # noqa: E402
 
 RIVALS = ("bicubic", "taau", "guided-taau")
 MAX_MEGABYTES = 2.0
-WEIGHTS, CARDS = ROOT / "jaxsr" / "weights", ROOT / "docs" / "models"
+WEIGHTS, CARDS = ROOT / "jaxsr" / "weights" / "released", ROOT / "docs" / "models"
 RESULTS = ROOT / "experiments" / "results"
 
 
@@ -92,7 +92,7 @@ def release(name: str, run: Run, weights: Path, head: dict[str, Any]) -> None:
     print(f"{weights.name}: {weights.stat().st_size / 1e6:.2f} MB")
 
 
-def table(sections: list[Section]) -> list[str]:
+def table(sections: list[SequenceResult]) -> list[str]:
     """Means over the frames of each scene."""
     keys = sections[0].metric_keys()
     lines = [
@@ -107,7 +107,7 @@ def table(sections: list[Section]) -> list[str]:
     return lines
 
 
-def card(name: str, run: Run, head: dict[str, Any], sections: list[Section], weights: Path) -> str:
+def card(name: str, run: Run, head: dict[str, Any], sections: list[SequenceResult], weights: Path) -> str:
     """The model card as Markdown."""
     sizes = {name: math.prod(array.shape) for name, array in load_weights(weights)[0].items()}
     statistics = sum(size for name, size in sizes.items() if name.endswith((".mean", ".var")))

@@ -34,17 +34,17 @@ from tyro.conf import Positional  # noqa: E402
 
 from experiments.make_datasets import CACHE, Render, clips_of  # noqa: E402
 from experiments.provenance import commit  # noqa: E402
+from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
 from jaxsr.evaluation.measuring import Reference  # noqa: E402
-from jaxsr.evaluation.progress import bars  # noqa: E402
-from jaxsr.evaluation.run import Ready, find_method  # noqa: E402
-from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
-from jaxsr.evaluation.tables import json_value  # noqa: E402
-from jaxsr.evaluation.upscale import Settings, run_track  # noqa: E402
+from jaxsr.evaluation.running import Settings, run_method  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
 from jaxsr.methods import LEARNED, Method, build, fusion_sr  # noqa: E402
+from jaxsr.progress import bars  # noqa: E402
+from jaxsr.report.tables import json_value  # noqa: E402
+from jaxsr.runtime.load import LoadedMethod, find_method  # noqa: E402
 from jaxsr.training.config import TrainConfig  # noqa: E402
 from jaxsr.training.loop import train  # noqa: E402
 
@@ -162,7 +162,7 @@ def record_of(run: Path) -> dict[str, Any]:
     }
 
 
-def measure(ready: Ready, clips: list[Path], frames: Path) -> dict[str, Any]:
+def measure(ready: LoadedMethod, clips: list[Path], frames: Path) -> dict[str, Any]:
     """Every metric of every measured frame, by scene; the frames that were made stay in `frames`."""
     scenes, begun = {}, time.monotonic()
     with bars() as progress:
@@ -171,7 +171,7 @@ def measure(ready: Ready, clips: list[Path], frames: Path) -> dict[str, Any]:
         for sequence in sequences:
             settings = Settings(SCALE, warmup=WARM_UP)
             reference = Reference(sequence, in_regions=True)
-            track = run_track(sequence, ready, frames / sequence.name, settings, reference, advance)
+            track = run_method(sequence, ready, frames / sequence.name, settings, reference, advance)
             assert track.cost is not None
             scenes[sequence.name.split("-")[0]] = {
                 "sequence": sequence.name,

@@ -27,9 +27,9 @@ from tyro.conf import Positional  # noqa: E402
 
 from experiments.fusion_sr.figures import Shown, sheet  # noqa: E402
 from experiments.fusion_sr.study import RESULTS, RUNS, SCALE, VARIANTS, WARM_UP, results_file  # noqa: E402
+from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.measuring import display  # noqa: E402
-from jaxsr.evaluation.sample import unpack_sample  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.images import read_png, write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402

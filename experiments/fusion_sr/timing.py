@@ -38,12 +38,12 @@ from experiments.fusion_sr.study import RESULTS, VARIANTS, Variant  # noqa: E402
 from experiments.fusion_sr.tables import IMAGES, PAGE, on_page, write  # noqa: E402
 from experiments.make_datasets import SCENES, device  # noqa: E402
 from experiments.provenance import commit  # noqa: E402
+from jaxsr.blender import render as blender  # noqa: E402
 from jaxsr.data import analytic  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
-from jaxsr.evaluation.cost import count_parameters, multiply_adds_of  # noqa: E402
-from jaxsr.io import blender  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.methods import METHODS  # noqa: E402
+from jaxsr.runtime.cost import count_parameters, multiply_adds_of  # noqa: E402
 
 SIZE, SCALE = (1920, 1080), 4
 JITTER = ((0.0, -0.17), (-0.25, 0.17))

@@ -22,12 +22,12 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.measuring import Meter, Truth
-from jaxsr.evaluation.report import write_report
-from jaxsr.evaluation.sections import Section, Track
-from jaxsr.evaluation.tables import write_metrics
 from jaxsr.io.images import read_color, read_png, write_png
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.ops.color import to_display
+from jaxsr.report.page import write_report
+from jaxsr.report.results import MethodResult, SequenceResult
+from jaxsr.report.tables import write_metrics
 
 Progress = Callable[[str, int], Callable[[], Any]]
 """Called with a title and a number of steps; gives what is called after each step."""
@@ -178,7 +178,7 @@ def compare(
     max_megabytes: float = 18.0,
     keys: Collection[str] | None = None,
     progress: Progress | None = None,
-) -> Section:
+) -> SequenceResult:
     """Measure folders of frames against the truth; write report.html, metrics.json, .csv and .md into `out`.
 
     Args:
@@ -222,7 +222,7 @@ def compare(
     title = title or f"{' · '.join(names)} against {truth.resolve().name}"
     with _staging(out) as folder:
         shown = _Shown(folder, exposure)
-        section = Section(
+        section = SequenceResult(
             title=f"{truth.resolve().name}: {', '.join(names)}" if len(names) < 4 else truth.resolve().name,
             frames=true.numbers or tuple(range(1, len(true.files) + 1)),
             truths=[shown.path("truth", file) for file in true.files],
@@ -299,7 +299,7 @@ def _measured(
     shown: _Shown,
     meter: Meter,
     advance: Callable[[], Any],
-) -> Track:
+) -> MethodResult:
     """All metrics of a folder, two frames in memory at a time."""
     size: tuple[int, ...] | None = None
     for file, true_file, start in zip(frames.files, true.files, starts, strict=True):

@@ -10,15 +10,15 @@ import jax
 import numpy as np
 
 import jaxsr
-from jaxsr.evaluation.embedding import to_bytes
 from jaxsr.evaluation.measuring import Reference, metrics_with
-from jaxsr.evaluation.report import write_report
-from jaxsr.evaluation.run import find_method, shipped_scales
-from jaxsr.evaluation.sections import Section
-from jaxsr.evaluation.tables import write_metrics
-from jaxsr.evaluation.upscale import Settings, run_section
-from jaxsr.evaluation.video import write_video
+from jaxsr.evaluation.running import Settings, run_methods
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.report.embedding import to_bytes
+from jaxsr.report.page import write_report
+from jaxsr.report.results import SequenceResult
+from jaxsr.report.tables import write_metrics
+from jaxsr.report.video import write_video
+from jaxsr.runtime.load import find_method, shipped_scales
 
 UPSCALERS = ("nearest", "bilinear", "bicubic", "taau", "guided-taau")
 LEARNED = "fusion-sr"
@@ -46,7 +46,7 @@ def run_demo(
     scale: int,
     lpips: bool = False,
     progress: Callable[[str, int], Callable[[], Any]],
-) -> list[Section]:
+) -> list[SequenceResult]:
     """Run the demo and write frames, videos, metrics and the page into `out`.
 
     Args:
@@ -70,7 +70,7 @@ def run_demo(
         reference = Reference(sequence)
         for task in tasks:
             sections.append(
-                run_section(
+                run_methods(
                     sequence,
                     [find_method(name, scale) for name in task.methods],
                     out / sequence.name / task.name,
@@ -104,7 +104,7 @@ class _Task(NamedTuple):
     """Of these, the two in the video."""
 
 
-def _write_video(path: Path, section: Section, names: Sequence[str], fps: float) -> None:
+def _write_video(path: Path, section: SequenceResult, names: Sequence[str], fps: float) -> None:
     """Input, two methods and truth, two by two; the clip is short and plays four times."""
     tracks = {t.name: t.images for t in section.tracks}
     shown = {"input": enlarged(section), **{n: tracks[n] for n in names}, "truth": section.truths}
@@ -116,7 +116,7 @@ def _write_video(path: Path, section: Section, names: Sequence[str], fps: float)
     write_video(path, columns, fps=fps, per_row=2, captions=captions * 4)
 
 
-def enlarged(section: Section) -> list[np.ndarray]:
+def enlarged(section: SequenceResult) -> list[np.ndarray]:
     """The inputs at the size of the truth by pixel repetition; the last one stays where none was rendered."""
     height = to_bytes(section.truths[0]).shape[0]
     images: list[np.ndarray] = []

@@ -14,22 +14,23 @@ from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.compare import labels
 from jaxsr.evaluation.kept import run_kept
 from jaxsr.evaluation.measuring import Reference
-from jaxsr.evaluation.report import write_report
-from jaxsr.evaluation.run import Ready, check_needs, find_method
-from jaxsr.evaluation.sections import Section
-from jaxsr.evaluation.tables import write_metrics
-from jaxsr.evaluation.upscale import Settings, run_section
+from jaxsr.evaluation.running import Settings, run_methods
 from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.report.page import write_report
+from jaxsr.report.results import SequenceResult
+from jaxsr.report.tables import write_metrics
+from jaxsr.runtime.load import LoadedMethod, find_method
+from jaxsr.runtime.schedule import check_needs
 
 
-def find_methods(names: Sequence[str], scale: int) -> list[Ready]:
+def find_methods(names: Sequence[str], scale: int) -> list[LoadedMethod]:
     """The methods of these names or files of weights, each with a name of its own.
 
     Raises:
         JaxsrError: as for `find_method`; no name; two that would be called the same.
     """
-    found: dict[str, Ready] = {}
+    found: dict[str, LoadedMethod] = {}
     for name in names:
         ready = find_method(name, scale)
         if ready.method.name in found:
@@ -66,7 +67,7 @@ def part(sequence: FrameSequence, frames: tuple[int, int] | None) -> FrameSequen
     return found
 
 
-def _check(sequence: FrameSequence, methods: Sequence[Ready], settings: Settings) -> None:
+def _check(sequence: FrameSequence, methods: Sequence[LoadedMethod], settings: Settings) -> None:
     """See that all can be run and measured, before any work is done."""
     for i in range(len(sequence)):
         if "color" not in sequence.layers("hr", i):
@@ -91,7 +92,7 @@ def evaluate(
     title: str = "jaxsr evaluation",
     meta: Mapping[str, Any] | None = None,
     progress: Callable[[str, int], Callable[[], Any]],
-) -> list[Section]:
+) -> list[SequenceResult]:
     """Run methods over sequences, measure them, and write frames, numbers and the page into `out`.
 
     Args:
@@ -105,7 +106,7 @@ def evaluate(
         A section a sequence; `rich_tables` prints them.
 
     Raises:
-        JaxsrError: see `find_sequences`, `find_methods`, `part`, `check_needs`, `run_section`.
+        JaxsrError: see `find_sequences`, `find_methods`, `part`, `check_needs`, `run_methods`.
     """
     if out.exists() and not out.is_dir():
         raise JaxsrError("not a folder", where=out, fix="choose another --out")
@@ -118,7 +119,7 @@ def evaluate(
     advance = progress("frames", 2 * len(ready) * sum(map(len, sequences)))  # made, and measured
     compiled: dict[Any, float] = {}
     sections = [
-        run_section(
+        run_methods(
             sequence,
             ready,
             out / name,

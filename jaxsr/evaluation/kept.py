@@ -17,32 +17,32 @@ from typing import Any
 import jax
 
 import jaxsr
-from jaxsr.evaluation.cost import Cost
 from jaxsr.evaluation.measuring import Reference
-from jaxsr.evaluation.run import Ready
-from jaxsr.evaluation.sections import Timing, Track
-from jaxsr.evaluation.tables import json_value
-from jaxsr.evaluation.upscale import Advance, Settings, check_folder, png_file, run_track
-from jaxsr.io.exr import atomic_path
+from jaxsr.evaluation.running import Advance, Settings, check_folder, png_file, run_method
+from jaxsr.files import atomic_path
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.metrics import available
+from jaxsr.report.results import MethodResult, Timing
+from jaxsr.report.tables import json_value
+from jaxsr.runtime.cost import Cost
+from jaxsr.runtime.load import LoadedMethod
 
 RECORD = "result.json"
 FOLDERS = ("exr", "png", "flip")
-NOT_CODE = ("cli.py", "training", "data", "evaluation/report.py", "evaluation/tables.py")
+NOT_CODE = ("cli.py", "training", "data", "report/page.py", "report/tables.py")
 """Of the package, what results do not depend on; who edits a method wants new ones."""
 PACKAGES = ("jax", "numpy", "dm-pix", "flip-evaluator")
 
 
 def run_kept(
     sequence: FrameSequence,
-    ready: Ready,
+    ready: LoadedMethod,
     out: Path,
     settings: Settings,
     reference: Reference,
     advance: Advance = lambda: None,
-) -> Track:
-    """`run_track`, or what it gave when it was last run with the same settings on the same files."""
+) -> MethodResult:
+    """`run_method`, or what it gave when it was last run with the same settings on the same files."""
     key = _key(sequence, ready, settings, reference)
     measured = sequence.infos[settings.warmup :]
     images = [png_file(out, info.index) for info in measured]
@@ -57,7 +57,7 @@ def run_kept(
             shutil.rmtree(out / name, ignore_errors=True)
     check_folder(out, {info.index for info in sequence.infos})
     _write(out / RECORD, {"key": key})
-    track = run_track(sequence, ready, out, settings, reference, advance)
+    track = run_method(sequence, ready, out, settings, reference, advance)
     for file, flip in zip(flips, track.flip_maps, strict=True):
         with atomic_path(file) as temporary:
             temporary.write_bytes(flip)
@@ -65,7 +65,9 @@ def run_kept(
     return track
 
 
-def _key(sequence: FrameSequence, ready: Ready, settings: Settings, reference: Reference) -> dict[str, Any]:
+def _key(
+    sequence: FrameSequence, ready: LoadedMethod, settings: Settings, reference: Reference
+) -> dict[str, Any]:
     files = [file for name in sequence.resolutions for file in sorted((sequence.path / name).iterdir())]
     stats = [(file.parent.name, file.name, file.stat()) for file in files]
     listing = [f"{folder}/{name} {stat.st_size} {stat.st_mtime_ns}" for folder, name, stat in stats]
@@ -93,7 +95,7 @@ def _digest(parts: Iterable[bytes]) -> str:
     return digest.hexdigest()
 
 
-def _as_json(track: Track) -> dict[str, Any]:
+def _as_json(track: MethodResult) -> dict[str, Any]:
     return {
         "name": track.name,
         "note": track.note,
@@ -104,14 +106,14 @@ def _as_json(track: Track) -> dict[str, Any]:
     }
 
 
-def _load(record: Path, key: Mapping[str, Any], images: list[Path], flips: list[Path]) -> Track | None:
+def _load(record: Path, key: Mapping[str, Any], images: list[Path], flips: list[Path]) -> MethodResult | None:
     """The track of a record, if it is finished, has this key, and its pictures are there."""
     try:
         found = json.loads(record.read_text(encoding="utf-8"))
         if found["key"] != json.loads(json.dumps(json_value(key))) or not all(p.is_file() for p in images):
             return None
         track = found["track"]
-        return Track(
+        return MethodResult(
             track["name"],
             images,
             _numbers(track["metrics"]),

@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxsr.evaluation.cost import Cost
-from jaxsr.evaluation.embedding import ImageOrPath, flip_jpeg
 from jaxsr.evaluation.regions import regions
-from jaxsr.evaluation.sections import ALL, Timing, Track
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.metrics import available, flip_map, measure_frame
 from jaxsr.ops import to_display
+from jaxsr.report.embedding import ImageOrPath, flip_jpeg
+from jaxsr.report.results import ALL, MethodResult, Timing
+from jaxsr.runtime.cost import Cost
 
 CACHE_BYTES = 256e6
 """How much of the truth a `Reference` keeps."""
@@ -109,10 +109,12 @@ class Meter:
         timing: Timing | None = None,
         note: str = "",
         cost: Cost | None = None,
-    ) -> Track:
+    ) -> MethodResult:
         """What was measured, as that of these images."""
         regions = {region: values for region, values in self._found.items() if region != ALL}
-        return Track(name, images, self._found.get(ALL, {}), timing, note, self._flip_maps, regions, cost)
+        return MethodResult(
+            name, images, self._found.get(ALL, {}), timing, note, self._flip_maps, regions, cost
+        )
 
 
 def measured(
@@ -123,7 +125,7 @@ def measured(
     starts: Sequence[bool] | None = None,
     timing: Timing | None = None,
     note: str = "",
-) -> Track:
+) -> MethodResult:
     """A track with every metric, of images that are in memory.
 
     Args:

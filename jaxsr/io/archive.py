@@ -17,8 +17,9 @@ from typing import Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
+from jaxsr.files import atomic_path, remove_leftovers
 from jaxsr.io.archive_coding import decode_frame, encode_frame
-from jaxsr.io.exr import atomic_path, read_exr, remove_leftovers
+from jaxsr.io.exr import read_exr
 from jaxsr.io.sequence import Sequence, check_head, frame_info
 from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter, frame_file
 

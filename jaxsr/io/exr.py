@@ -9,7 +9,6 @@ read. Writing is single-part, scan lines, lossless, and atomic.
 import contextlib
 import mmap
 import os
-import re
 import struct
 import sys
 import threading
@@ -21,6 +20,7 @@ import numpy as np
 import OpenEXR
 
 from jaxsr.errors import JaxsrError
+from jaxsr.files import atomic_path
 
 _COMPRESSIONS = {
     "none": OpenEXR.NO_COMPRESSION,
@@ -35,31 +35,6 @@ _STRUCTURE = {
 }  # fmt: skip
 _LINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
 _MAGIC = 20000630
-_TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp")
-
-
-@contextlib.contextmanager
-def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary name in the folder of `path` that replaces `path` when the block ends without an error."""
-    path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        yield temporary
-        temporary.replace(path)
-    except OSError as e:
-        raise JaxsrError("cannot write", where=path, found=e.strerror or e, fix="check the folder") from e
-    finally:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-
-
-def remove_leftovers(folder: Path) -> int:
-    """Delete what killed writers left in `folder` (names that `atomic_path` gives); returns how many."""
-    leftovers = [p for p in Path(folder).glob(".*.tmp") if _TEMPORARY.fullmatch(p.name)]
-    for path in leftovers:
-        path.unlink(missing_ok=True)
-    return len(leftovers)
 
 
 def read_exr(path: str | Path, *, pad: bool = True) -> tuple[dict[str, np.ndarray], dict[str, Any]]:

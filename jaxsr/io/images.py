@@ -11,7 +11,8 @@ from jaxtyping import Float, UInt8
 from PIL import Image, UnidentifiedImageError
 
 from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import atomic_path, read_exr
+from jaxsr.files import atomic_path
+from jaxsr.io.exr import read_exr
 
 
 def write_png(

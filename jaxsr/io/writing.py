@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import atomic_path, remove_leftovers, write_exr
+from jaxsr.files import atomic_path, remove_leftovers
+from jaxsr.io.exr import write_exr
 
 if TYPE_CHECKING:
     from jaxsr.frames import Camera

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 from jaxsr.errors import JaxsrError
 from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, nsrr, rcan, rrn, taau
-from jaxsr.methods._method import Method
+from jaxsr.methods.base import Method
 
 
 class Learned(NamedTuple):

@@ -12,9 +12,9 @@ from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame
 from jaxsr.losses import lpips, ssim_loss
 from jaxsr.methods import guided, taau
-from jaxsr.methods._method import Net
+from jaxsr.methods.base import Net
+from jaxsr.nets.vgg import MIN_SIZE
 from jaxsr.ops import backward_warp
-from jaxsr.perceptual import MIN_SIZE
 
 
 @dataclass(frozen=True)

@@ -39,10 +39,10 @@ from jaxtyping import Array, Float, Int
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, GBuffer, Window
 from jaxsr.methods import guided, guided_taau, taau
-from jaxsr.methods._method import Loss, Method, Net, by_rendered
 from jaxsr.methods._network import ImageLoss, check_options, image_loss, last_output
+from jaxsr.methods.base import Loss, Method, Net, by_rendered
 from jaxsr.nets import FusionSR, UNetSR
-from jaxsr.nets.layers import count_channels
+from jaxsr.nets.blocks import count_channels
 from jaxsr.ops import demodulate, from_display, modulate, to_display
 
 BUFFERS = ("depth", "base_color", "normal", "roughness", "metallic")

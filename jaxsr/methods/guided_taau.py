@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 
 from jaxsr.frames import Frame, GBuffer
 from jaxsr.methods import guided, taau
-from jaxsr.methods._method import Method, by_rendered
+from jaxsr.methods.base import Method, by_rendered
 from jaxsr.ops import demodulate, modulate
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsr.frames import Frame
-from jaxsr.methods._method import Method, by_rendered
+from jaxsr.methods.base import Method, by_rendered
 from jaxsr.ops import sample_jittered
 
 

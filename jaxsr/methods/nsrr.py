@@ -29,8 +29,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, Window
-from jaxsr.methods._method import Loss, Method, Net, by_rendered
 from jaxsr.methods._network import ImageLoss, check_options, image_loss, last_output
+from jaxsr.methods.base import Loss, Method, Net, by_rendered
 from jaxsr.methods.fusion_sr import normalized_depth, sample_offset
 from jaxsr.nets import NSRR
 from jaxsr.nets.nsrr import CHANNELS

@@ -20,10 +20,10 @@ from jaxtyping import Array, Float
 
 from jaxsr.frames import Frame, Window
 from jaxsr.methods._color import ColorOptions, check_scale, color_input, shown, to_linear
-from jaxsr.methods._method import Loss, Method, Net, by_rendered
 from jaxsr.methods._network import check_options, image_loss, last_output
+from jaxsr.methods.base import Loss, Method, Net, by_rendered
 from jaxsr.nets import RRN
-from jaxsr.nets.layers import check_counts
+from jaxsr.nets.blocks import check_counts
 from jaxsr.nets.rrn import check_sizes
 from jaxsr.ops import to_display
 

@@ -29,7 +29,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsr.frames import Frame
-from jaxsr.methods._method import Method, by_rendered
+from jaxsr.methods.base import Method, by_rendered
 from jaxsr.ops import (
     backward_warp,
     inverse_tone_map,

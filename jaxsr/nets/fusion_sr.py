@@ -20,7 +20,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxsr.errors import JaxsrError
-from jaxsr.nets.layers import (
+from jaxsr.nets.blocks import (
     BatchNorm,
     ShallowFeatures,
     SqueezeExcite,

@@ -27,7 +27,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.nets.layers import ConvPair, ShallowFeatures, conv, conv_beside
+from jaxsr.nets.blocks import ConvPair, ShallowFeatures, conv, conv_beside
 from jaxsr.ops import upsample
 
 RGBD = 4

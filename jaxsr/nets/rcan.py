@@ -22,7 +22,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.nets.layers import LoopConv, SqueezeExcite, check_counts, stacked, through
+from jaxsr.nets.blocks import LoopConv, SqueezeExcite, check_counts, stacked, through
 from jaxsr.ops import depth_to_space
 
 MEAN = (0.4488, 0.4371, 0.4040)

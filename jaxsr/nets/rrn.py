@@ -19,7 +19,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.nets.layers import LoopConv, check_counts
+from jaxsr.nets.blocks import LoopConv, check_counts
 from jaxsr.ops import depth_to_space, space_to_depth, upsample
 
 INIT = nnx.initializers.variance_scaling(0.02, "fan_in", "normal")

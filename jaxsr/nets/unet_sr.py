@@ -11,7 +11,7 @@ from flax import nnx
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
-from jaxsr.nets.layers import (
+from jaxsr.nets.blocks import (
     ShallowFeatures,
     UpConcat,
     check_channels,

@@ -22,7 +22,7 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import atomic_path
+from jaxsr.files import atomic_path
 from jaxsr.training.state import TrainState
 
 KEEP = 3

@@ -19,7 +19,7 @@ import jax
 
 import jaxsr
 from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import atomic_path
+from jaxsr.files import atomic_path
 from jaxsr.io.sequence import Sequence
 from jaxsr.methods import Method
 

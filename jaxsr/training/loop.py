@@ -22,24 +22,24 @@ from flax import nnx
 from jax.sharding import NamedSharding
 
 import jaxsr
-from jaxsr import perceptual
 from jaxsr.data.cache import default_cache
 from jaxsr.data.loader import Loader, make_loader
+from jaxsr.data.sample import sample_folder, unpack_sample
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.progress import bars
-from jaxsr.evaluation.sample import sample_folder, unpack_sample
 from jaxsr.frames import Window
 from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence, prefetch
-from jaxsr.io.weights import into, load_weights, save_weights
 from jaxsr.methods import Method
-from jaxsr.methods._method import Net
+from jaxsr.methods.base import Net
+from jaxsr.nets import vgg as perceptual
+from jaxsr.progress import bars
 from jaxsr.training.checkpoints import FOLDER, Checkpoints, has_checkpoints
 from jaxsr.training.config import TrainConfig, describe, enter, identity
 from jaxsr.training.evaluate import Evaluator
 from jaxsr.training.record import Bar, Log
 from jaxsr.training.state import begin, inference_net, schedule
 from jaxsr.training.step import make_step, shardings
+from jaxsr.weights.file import into, load_weights, save_weights
 
 LOG_EVERY = 10
 """Steps whose mean makes a row of the log."""

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.io.exr import atomic_path
+from jaxsr.files import atomic_path
 from jaxsr.io.images import write_png
 
 

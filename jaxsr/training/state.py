@@ -9,7 +9,7 @@ from flax import nnx
 from jaxtyping import Array, Int
 
 from jaxsr.methods import Method
-from jaxsr.methods._method import Net
+from jaxsr.methods.base import Net
 from jaxsr.training.config import TrainConfig
 
 

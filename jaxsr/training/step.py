@@ -17,7 +17,7 @@ from jaxtyping import Array
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.methods import Method
-from jaxsr.methods._method import Net
+from jaxsr.methods.base import Net
 from jaxsr.training.config import TrainConfig
 from jaxsr.training.state import TrainState, optimizer
 

@@ -1,0 +1,1 @@
+"""Rendering with Blender, which runs in a process of its own."""

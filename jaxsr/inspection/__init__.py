@@ -1,0 +1,1 @@
+"""Which conventions an export follows, and verdicts on it."""

@@ -1,0 +1,407 @@
+"""Which convention do buffers follow? Hypotheses are tried on the pixels, and the data chooses.
+
+Pure NumPy functions on `[H, W, C]` arrays of two consecutive images; no files, no text for people (that is
+`jaxsr.inspection.inspect`). Motion: the previous image (base colour or colour, normals, disparity) is warped
+by every reading of the stored vectors and compared with the current one; camera and depth say apart from that
+where points that stand still must have been. Jitter: the LR G-buffer is looked up in the HR one. Errors are
+capped, so that disocclusions and moving shadows cannot outvote the rest.
+"""
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from jaxsr.io.geometry import image_plane, to_pixels, world_position
+from jaxsr.io.writing import FrameInfo
+
+Layers = Mapping[str, np.ndarray]
+Size = tuple[int, int]
+
+UNITS = {
+    "pixels": lambda w, h: (1.0, 1.0),
+    "half pixels (times 2)": lambda w, h: (2.0, 2.0),
+    "double pixels (times 0.5)": lambda w, h: (0.5, 0.5),
+    "quarter pixels (times 4)": lambda w, h: (4.0, 4.0),
+    "quadruple pixels (times 0.25)": lambda w, h: (0.25, 0.25),
+    "UV (times width, height)": lambda w, h: (float(w), float(h)),
+    "NDC (times half width, half height)": lambda w, h: (w / 2, h / 2),
+    "widths (times width)": lambda w, h: (float(w), float(w)),
+}
+
+
+@dataclass(frozen=True)
+class MotionConvention:
+    """A reading of stored motion vectors. The default is jaxsr's: `p_prev = p - motion`, pixels, y down."""
+
+    unit: str = "pixels"
+    signs: tuple[int, int] = (1, 1)
+    swapped: bool = False
+    forward: bool = False
+
+    @property
+    def name(self) -> str:
+        parts = ["forward" if self.forward else "backward", self.unit]
+        parts += {
+            (1, 1): ["y down"],
+            (1, -1): ["y up"],
+            (-1, 1): ["y down", "x flipped"],
+            (-1, -1): ["y down", "both signs flipped"],
+        }[self.signs]
+        return ", ".join(parts + ["axes swapped"] * self.swapped)
+
+    def to_pixels(self, stored: np.ndarray, size: Size) -> np.ndarray:
+        """`p - p_prev` (or `p_next - p` when `forward`) in pixels, y down, from stored `[..., 2]`."""
+        vectors = stored[..., ::-1] if self.swapped else stored
+        return vectors * (np.array(UNITS[self.unit](*size)) * self.signs)
+
+
+CANONICAL = MotionConvention()
+CONVENTIONS = [
+    MotionConvention(unit, signs, swapped, forward)
+    for forward, swapped, unit, signs in itertools.product(
+        (False, True), (False, True), UNITS, itertools.product((1, -1), (1, -1))
+    )
+]
+
+
+@dataclass
+class MotionEvidence:
+    """Errors of the conventions on one pair of frames."""
+
+    moves: bool
+    """Some stored vector is not zero."""
+    camera_px: float
+    """How far the camera alone moves points, median in pixels."""
+    image_change: float
+    """Warp error without motion: 0 where the images are equal or flat; in pixels, about."""
+    image: dict[MotionConvention, float] = field(default_factory=dict)
+    """Warp error relative to no motion."""
+    camera: dict[MotionConvention, float] = field(default_factory=dict)
+    """Median distance in pixels to where a point that stands still must have been."""
+
+
+def features(layers: Layers, scale: np.ndarray | None = None) -> np.ndarray:
+    """What stays with a surface as it moves: base colour (else log colour), normal, disparity; 0 for sky."""
+    planes = []
+    textured = "base_color" in layers and _gradient(layers["base_color"]).mean() > 1e-3
+    if textured:
+        planes.append(layers["base_color"])
+    elif "color" in layers:
+        planes.append(np.log1p(np.maximum(layers["color"], 0)))
+    if "normal" in layers:
+        planes.append(layers["normal"])
+    with np.errstate(divide="ignore"):
+        planes.append(np.where(is_sky(layers["depth"]), 0, 1 / layers["depth"]))
+    out = finite_or_zero(np.concatenate(planes, -1))
+    return out if scale is None else out * scale
+
+
+def finite_or_zero(x: np.ndarray) -> np.ndarray:
+    """float64, with 0 for NaN and Inf: faults are counted elsewhere, and must not stop the judging."""
+    return np.nan_to_num(x.astype(np.float64), posinf=0, neginf=0)
+
+
+def is_sky(depth: np.ndarray) -> np.ndarray:
+    """`[H, W, 1]`: infinite depth, or so large that it can only mean that."""
+    return ~(depth < 1e9)
+
+
+def normalise(current: np.ndarray) -> np.ndarray:
+    """Factors for each channel that make an error of 1 about one pixel of displacement; 0 for flat ones."""
+    step = _gradient(current).reshape(-1, current.shape[-1]).mean(0)
+    return np.where(step > 1e-4, 1 / np.maximum(step, 1e-4), 0) / max(int((step > 1e-4).sum()), 1)
+
+
+def motion_evidence(
+    current: Layers, previous: Layers, info: FrameInfo, info_previous: FrameInfo, samples: int = 4000
+) -> MotionEvidence:
+    """Try every convention on one pair of unjittered images.
+
+    Args:
+        current, previous: layers `[H, W, C]`: depth and motion, and base_color, normal, color where there.
+        info, info_previous: their cameras.
+        samples: how many pixels are looked at.
+    """
+    h, w = current["depth"].shape[:2]
+    directions = {
+        False: (current, previous, info, info_previous),
+        True: (previous, current, info_previous, info),
+    }
+    scale = normalise(_blur(features(current)))
+    solid = ~is_sky(current["depth"])[..., 0]
+    still_motion = static_motion(current["depth"], info, info_previous)[solid]
+    evidence = MotionEvidence(
+        moves=bool(np.abs(finite_or_zero(current["motion"])).max(initial=0) > 1e-7),
+        camera_px=float(np.median(np.linalg.norm(still_motion, axis=-1))) if solid.any() else 0.0,
+        image_change=0.0,
+    )
+    for forward, (here, there, info_here, info_there) in directions.items():
+        f_here, f_there = (_blur(features(x)) * scale for x in (here, there))
+        motion = finite_or_zero(here["motion"])
+        length = np.abs(motion).sum(-1)
+        moving = ~is_sky(here["depth"])[..., 0]
+        if (moving & (length > 0)).any():
+            moving &= length >= 0.1 * np.quantile(length[moving & (length > 0)], 0.95)
+        p = _pick(moving & _interior(h, w), _gradient(f_here).sum(-1), samples)
+        if not len(p):
+            continue
+        target = f_here[p[:, 1], p[:, 0]]
+        expected = static_motion(here["depth"], info_here, info_there)[p[:, 1], p[:, 0]]
+        still = _error(target, f_there, p)
+        cap = 2 * float(still.mean())
+        none = float(np.minimum(still, cap).mean())
+        if not forward:
+            evidence.camera_px = float(np.median(np.linalg.norm(expected, axis=-1)))
+            evidence.image_change = none
+        for c in CONVENTIONS:
+            if c.forward != forward:
+                continue
+            vectors = c.to_pixels(motion[p[:, 1], p[:, 0]], (w, h)) * (-1 if forward else 1)
+            error = np.minimum(_error(target, f_there, p - vectors), cap)
+            error[~_inside(p - vectors, w, h)] = cap
+            evidence.image[c] = float(error.mean()) / none if none > 0 else 1.0
+            evidence.camera[c] = float(np.median(np.linalg.norm(vectors - expected, axis=-1)))
+    return evidence
+
+
+def static_motion(depth: np.ndarray, info: FrameInfo, info_previous: FrameInfo) -> np.ndarray:
+    """`[h, w, 2]`: backward motion, in pixels, of points that stand still; 0 for sky."""
+    h, w = depth.shape[:2]
+    finite = np.where(is_sky(depth), np.inf, depth)
+    grid, _ = image_plane((w, h), info)
+    back, _ = project(world_position(finite, info).astype(np.float64), info_previous, (w, h))
+    return np.where(is_sky(depth), 0, grid - back)
+
+
+def project(points: np.ndarray, info: FrameInfo, size: Size) -> tuple[np.ndarray, np.ndarray]:
+    """World points `[..., 3]` to pixels `[..., 2]` and view depth `[...]`."""
+    matrix = np.asarray(info.world_from_view, np.float64)
+    local = (points - matrix[:3, 3]) @ np.linalg.pinv(matrix[:3, :3]).T
+    z = np.where(np.abs(local[..., 2:]) < 1e-9, 1e-9, local[..., 2:])
+    return to_pixels(local[..., :2], z, info, size), local[..., 2]
+
+
+CAMERAS = {
+    "as stated": lambda m: m,
+    "OpenGL axes (y up, z backward)": lambda m: m @ np.diag([1.0, -1.0, -1.0, 1.0]),
+    "inverted (view_from_world)": lambda m: np.linalg.pinv(m),
+    "transposed": lambda m: m.T,
+    "inverted, OpenGL axes": lambda m: np.linalg.pinv(m) @ np.diag([1.0, -1.0, -1.0, 1.0]),
+}
+DEPTHS = {
+    "linear view depth": lambda d, ray: d,
+    "distance along the ray": lambda d, ray: d / ray,
+    "reciprocal of depth": lambda d, ray: 1 / d,
+    "view depth in centimetres": lambda d, ray: d / 100,
+}
+
+
+def camera_evidence(
+    depth: np.ndarray, motion_px: np.ndarray, info: FrameInfo, info_previous: FrameInfo
+) -> dict[tuple[str, str], float]:
+    """Median distance, relative to the motion, between the motion and what camera and depth imply.
+
+    Args:
+        depth, motion_px: `[h, w, 1]` and `[h, w, 2]`, the motion already converted to jaxsr's convention.
+
+    Returns:
+        (camera, depth) -> error; 0 is perfect, 1 no better than no motion.
+    """
+    h, w = depth.shape[:2]
+    solid = ~is_sky(depth)[..., 0]
+    if not solid.any():
+        return {}
+    unit = np.ones((h, w, 1), np.float32)
+    flat = replace(info, world_from_view=np.eye(4))
+    ray = np.linalg.norm(world_position(unit, flat), axis=-1, keepdims=True)
+    size = float(np.median(np.linalg.norm(motion_px[solid], axis=-1)))
+    out = {}
+    for (camera, turn), (kind, convert) in itertools.product(CAMERAS.items(), DEPTHS.items()):
+        infos = [
+            replace(x, world_from_view=turn(np.asarray(x.world_from_view, float)))
+            for x in (info, info_previous)
+        ]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = np.where(solid[..., None], convert(depth, ray), np.inf)
+        difference = (static_motion(z, infos[0], infos[1]) - motion_px)[solid]
+        out[camera, kind] = float(np.median(np.linalg.norm(difference, axis=-1))) / max(size, 1e-9)
+    return out
+
+
+JITTERS = {
+    "as stated": lambda x, y, s: (x, y),
+    "no jitter": lambda x, y, s: (0.0, 0.0),
+    "x flipped": lambda x, y, s: (-x, y),
+    "y flipped": lambda x, y, s: (x, -y),
+    "both signs flipped": lambda x, y, s: (-x, -y),
+    "axes swapped": lambda x, y, s: (y, x),
+    "stated in HR pixels": lambda x, y, s: (x / s, y / s),
+}
+
+
+def jitter_evidence(
+    lr: Layers, hr: Layers, jitter_px: np.ndarray, scale: int, samples: int = 4000
+) -> tuple[dict[str, float], np.ndarray | None]:
+    """Look the LR G-buffer up in the HR one, displaced by every reading of the stated jitter.
+
+    Returns:
+        reading -> error (about LR pixels; empty if the images are flat), and the jitter that fits best.
+    """
+    lr = {k: v for k, v in lr.items() if k != "color"}  # colour may be noisy, and lit otherwise
+    hr = {k: v for k, v in hr.items() if k != "color"}
+    shared = set(lr) & set(hr)
+    f_lr, f_hr = (features({k: x[k] for k in shared}) for x in (lr, hr))
+    if f_lr.shape[-1] != f_hr.shape[-1]:  # one of them has a base colour without texture
+        f_lr, f_hr = (features({k: x[k] for k in shared - {"base_color"}}) for x in (lr, hr))
+    weight = normalise(f_hr) / scale
+    f_lr, f_hr = f_lr * weight, f_hr * weight
+    h, w = f_lr.shape[:2]
+    p = _pick(_interior(h, w), _gradient(f_lr).sum(-1), samples)
+    if not len(p) or not weight.any():
+        return {}, None
+    target = f_lr[p[:, 1], p[:, 0]]
+
+    def residual(jitter: np.ndarray) -> np.ndarray:
+        return _bilinear(f_hr, (p + jitter + 0.5) * scale - 0.5) - target
+
+    def error(jitter: np.ndarray, cap: float) -> float:
+        return float(np.minimum(np.abs(residual(jitter)).sum(-1), cap).mean())
+
+    cap = 2 * float(np.median(np.abs(residual(np.array([0.5, 0.5]))).sum(-1))) + 1e-6
+    x, y = (float(v) for v in jitter_px)
+    errors = {name: error(np.array(read(x, y, scale)), cap) for name, read in JITTERS.items()}
+
+    best = np.array(JITTERS[min(errors, key=lambda n: errors[n])](x, y, scale))
+    slope = (_gradients(f_hr)) * scale
+    for _ in range(8):  # Gauss-Newton on the better part of the pixels
+        r = residual(best)
+        keep = np.abs(r).sum(-1) <= np.quantile(np.abs(r).sum(-1), 0.6)
+        at = (p + best + 0.5) * scale - 0.5
+        g = np.stack([_bilinear(slope[k], at)[keep].ravel() for k in (0, 1)], -1)
+        step = np.linalg.lstsq(g, r[keep].ravel(), rcond=None)[0]
+        best = np.clip(best - step, -1, 1)
+        if np.abs(step).max() < 1e-4:
+            break
+    return errors, best
+
+
+LR_MOTIONS = {
+    "LR pixels, unjittered": lambda m, s, dj: m / s,
+    "HR pixels": lambda m, s, dj: m,
+    "jitter counted in": lambda m, s, dj: m / s + dj,
+    "jitter counted in, sign flipped": lambda m, s, dj: m / s - dj,
+    "zero everywhere: it was not exported": lambda m, s, dj: 0 * m,
+}
+
+
+def lr_motion_evidence(
+    lr: Layers, hr: Layers, jitter_px: np.ndarray, jitter_previous: np.ndarray, scale: int
+) -> dict[str, float]:
+    """Median distance, in LR pixels, between LR motion and HR motion read in several ways."""
+    h, w = lr["depth"].shape[:2]
+    grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
+    at = np.rint((grid + jitter_px + 0.5) * scale - 0.5).astype(int)
+    at = at.clip(0, (w * scale - 1, h * scale - 1))
+    m = finite_or_zero(hr["motion"])[at[:, 1], at[:, 0]]
+    stored = finite_or_zero(lr["motion"]).reshape(-1, 2)
+    solid = ~is_sky(lr["depth"]).ravel() & ~is_sky(hr["depth"])[at[:, 1], at[:, 0], 0]
+    if not solid.any() or not np.abs(m[solid]).max() > 1e-7:
+        return {}
+    # MV_J,t = MV_N,t + J_{t-1} - J_t (METHODS 1)
+    delta = np.asarray(jitter_previous, float) - np.asarray(jitter_px, float)
+    return {
+        name: float(np.median(np.linalg.norm(stored - read(m, scale, delta), axis=-1)[solid]))
+        for name, read in LR_MOTIONS.items()
+    }
+
+
+NORMALS = {
+    "world space": lambda n, r: n,
+    "world space, pointing inwards": lambda n, r: -n,
+    "view space (y down, z forward)": lambda n, r: n @ r.T,
+    "view space, OpenGL (y up, z backward)": lambda n, r: (n * (1, -1, -1)) @ r.T,
+    "world space, y up": lambda n, r: np.stack([n[..., 0], -n[..., 2], n[..., 1]], -1),
+    "0..1 encoded world space": lambda n, r: 2 * n - 1,
+}
+
+
+def normal_evidence(depth: np.ndarray, normal: np.ndarray, info: FrameInfo) -> dict[str, float]:
+    """Median angle in degrees between stored normals, read in several ways, and the surface seen in depth."""
+    position = world_position(np.where(is_sky(depth), np.inf, depth), info).astype(np.float64)
+    dx, dy = position[1:-1, 2:] - position[1:-1, :-2], position[2:, 1:-1] - position[:-2, 1:-1]
+    surface = np.cross(dx, dy)
+    middle = np.where(is_sky(depth), np.inf, depth)[..., 0]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bend = [
+            np.abs(1 / a + 1 / b - 2 / middle[1:-1, 1:-1]) * middle[1:-1, 1:-1]
+            for a, b in ((middle[1:-1, 2:], middle[1:-1, :-2]), (middle[2:, 1:-1], middle[:-2, 1:-1]))
+        ]
+        smooth = (bend[0] < 0.01) & (bend[1] < 0.01) & np.isfinite(middle[1:-1, 1:-1])
+    if smooth.sum() < 16:
+        return {}
+    matrix = np.asarray(info.world_from_view, float)
+    surface, seen = surface[smooth], position[1:-1, 1:-1][smooth] - matrix[:3, 3]
+    surface *= np.where(np.sum(surface * seen, -1, keepdims=True) > 0, -1, 1)
+    surface /= np.maximum(np.linalg.norm(surface, axis=-1, keepdims=True), 1e-12)
+    stored, out = finite_or_zero(normal)[1:-1, 1:-1][smooth], {}
+    for name, read in NORMALS.items():
+        n = read(stored, matrix[:3, :3])
+        n = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-9)
+        out[name] = float(np.degrees(np.median(np.arccos(np.clip(np.sum(n * surface, -1), -1, 1)))))
+    return out
+
+
+def _blur(x: np.ndarray) -> np.ndarray:
+    """Two 3x3 binomials: point samples of fine texture alias, and would drown sub-pixel differences."""
+    for _ in range(2):
+        for axis in (0, 1):
+            padded = np.pad(x, [(1, 1) if a == axis else (0, 0) for a in range(3)], mode="edge")
+            n = x.shape[axis]
+            a, b, c = (np.take(padded, np.arange(k, k + n), axis) for k in range(3))
+            x = 0.25 * a + 0.5 * b + 0.25 * c
+    return x
+
+
+def _gradients(x: np.ndarray) -> np.ndarray:
+    """`[2, h, w, c]`: derivatives along x and y."""
+    return np.stack([np.gradient(x, axis=k) if x.shape[k] > 1 else np.zeros_like(x) for k in (1, 0)])
+
+
+def _gradient(x: np.ndarray) -> np.ndarray:
+    return np.abs(_gradients(finite_or_zero(x))).sum(0)
+
+
+def _interior(h: int, w: int) -> np.ndarray:
+    mask = np.zeros((h, w), bool)
+    mask[1:-1, 1:-1] = True
+    return mask
+
+
+def _pick(mask: np.ndarray, texture: np.ndarray, samples: int) -> np.ndarray:
+    """`[n, 2]` pixels (x, y): of the textured half of `mask`, at most `samples`, evenly by number."""
+    values = texture[mask]
+    if not values.size or values.max() <= 0:
+        return np.zeros((0, 2), int)
+    y, x = np.nonzero(mask & (texture >= np.median(values)) & (texture > 0))
+    take = np.random.default_rng(0).permutation(len(x))[:samples]
+    return np.stack([x[take], y[take]], -1)
+
+
+def _inside(p: np.ndarray, w: int, h: int) -> np.ndarray:
+    return np.all((p >= -0.5) & (p <= np.array([w, h]) - 0.5), -1)
+
+
+def _error(target: np.ndarray, image: np.ndarray, p: np.ndarray) -> np.ndarray:
+    return np.abs(_bilinear(image, p) - target).sum(-1)
+
+
+def _bilinear(image: np.ndarray, p: np.ndarray) -> np.ndarray:
+    h, w = image.shape[:2]
+    p = np.clip(p, 0, (w - 1, h - 1))
+    x0, y0 = np.minimum(p.astype(int), (max(w - 2, 0), max(h - 2, 0))).T
+    x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
+    fx, fy = (p[:, 0] - x0)[:, None], (p[:, 1] - y0)[:, None]
+    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
+    return top * (1 - fy) + (image[y1, x0] * (1 - fx) + image[y1, x1] * fx) * fy

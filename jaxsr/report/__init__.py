@@ -1,0 +1,1 @@
+"""Showing results: tables, the comparison page, video."""

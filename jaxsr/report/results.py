@@ -1,0 +1,121 @@
+"""Results as small values: a `SequenceResult` is one sequence and task, a `MethodResult` one method in it.
+
+Images are display-referred, in [0, 1], `[H, W, 3]`, or the path of a PNG that holds them. Metrics are lists
+with one value a frame, named as in `jaxsr.metrics.METRICS`; None where a value is not defined and `inf` for
+the PSNR of identical images. They are over all pixels, and apart from that over the pixels of regions.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+from jaxsr.errors import JaxsrError
+from jaxsr.metrics import METRICS
+from jaxsr.report.embedding import ImageOrPath
+from jaxsr.runtime.cost import Cost
+
+Values: TypeAlias = Sequence[float | None]
+
+ALL = "all"
+"""The name of the region that is the whole image."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Time of one frame. Compilation happens once and is never part of the median."""
+
+    compile_s: float
+    """Seconds of compilation alone, before the first call."""
+    median_ms: float
+    """Median time of one frame in milliseconds."""
+    spread_ms: float
+    """Interquartile range of the time of one frame in milliseconds."""
+
+
+@dataclass(frozen=True)
+class MethodResult:
+    """One method on one sequence and task."""
+
+    name: str
+    images: Sequence[ImageOrPath]
+    metrics: Mapping[str, Values]
+    """Over all pixels."""
+    timing: Timing | None = None
+    note: str = ""
+    flip_maps: Sequence[bytes] = ()
+    """FLIP error maps for the page as grey JPEG (`flip_jpeg`), one a frame; empty if they are not wanted."""
+    regions: Mapping[str, Mapping[str, Values]] = field(default_factory=dict)
+    """The metrics again, over the pixels of a region alone: region -> metric -> values."""
+    cost: Cost | None = None
+
+    def over(self, region: str) -> Mapping[str, Values]:
+        """The metrics over the pixels of a region, "all" or one of `regions`; none if it was not measured."""
+        return self.metrics if region == ALL else self.regions.get(region, {})
+
+
+@dataclass(frozen=True)
+class SequenceResult:
+    """One sequence and task, for instance "bunker, x4, every second frame extrapolated"."""
+
+    title: str
+    frames: Sequence[int]
+    """Numbers of the frames, as files and people name them."""
+    truths: Sequence[ImageOrPath]
+    tracks: Sequence[MethodResult]
+    inputs: Sequence[ImageOrPath | None] = ()
+    """What the methods were given, at its own size; None for a frame that was not rendered."""
+    extrapolated: Sequence[bool] = ()
+    """True for frames that no method saw rendered; empty if there are none."""
+    exposure: float = 1.0
+    meta: Mapping[str, Any] = field(default_factory=dict)
+    task: str = ""
+    """Sections of one task, not empty, are averaged too: sequences under the same conditions."""
+
+    def __post_init__(self) -> None:
+        n = len(self.frames)
+        if n == 0:
+            raise JaxsrError("no frames", where=self.title)
+        if not self.tracks:
+            raise JaxsrError("no tracks", where=self.title)
+        names = [t.name for t in self.tracks]
+        if len(set(names)) != len(names):
+            raise JaxsrError("two tracks have the same name", where=self.title, found=names)
+        counts = {"truths": len(self.truths)}
+        counts |= {"inputs": len(self.inputs)} if self.inputs else {}
+        counts |= {"extrapolated": len(self.extrapolated)} if self.extrapolated else {}
+        for track in self.tracks:
+            counts[f"images of {track.name}"] = len(track.images)
+            counts |= {f"FLIP maps of {track.name}": len(track.flip_maps)} if track.flip_maps else {}
+            for region in (ALL, *track.regions):
+                for key, values in track.over(region).items():
+                    counts[f"{key} of {track.name}{'' if region == ALL else ', ' + region}"] = len(values)
+                    if key not in METRICS:
+                        raise JaxsrError(
+                            f"unknown metric '{key}'",
+                            where=f"{self.title}, {track.name}",
+                            expected=sorted(METRICS),
+                        )
+        for what, count in counts.items():
+            if count != n:
+                raise JaxsrError(
+                    f"{what}: wrong number", where=self.title, expected=f"{n} (frames)", found=count
+                )
+
+    def metric_keys(self) -> list[str]:
+        """Keys of the metrics that any track has, in the order of `METRICS`."""
+        return [key for key in METRICS if any(key in track.metrics for track in self.tracks)]
+
+    def regions(self) -> list[str]:
+        """ "all", and the regions that any track was measured on."""
+        return list(dict.fromkeys([ALL, *(region for track in self.tracks for region in track.regions)]))
+
+    def subsets(self) -> dict[str, list[int]]:
+        """Positions of the frames to average over: "all", and "extrapolated" and "rendered" if both exist."""
+        everything = list(range(len(self.frames)))
+        if not any(self.extrapolated) or all(self.extrapolated):
+            return {"all": everything}
+        return {
+            "extrapolated": [i for i in everything if self.extrapolated[i]],
+            "rendered": [i for i in everything if not self.extrapolated[i]],
+            "all": everything,
+        }

@@ -1,0 +1,1 @@
+"""Running methods: loading with weights, streaming, schedules, cost."""

@@ -1,0 +1,1 @@
+"""Files of weights: ours (safetensors), those that other programs wrote, and the released ones."""

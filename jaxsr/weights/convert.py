@@ -1,0 +1,73 @@
+"""Published weights to a file of ours: reading (`io`), names and layouts (`nets`), the method (`methods`)."""
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from flax import nnx
+
+import jaxsr
+from jaxsr.errors import JaxsrError
+from jaxsr.methods import build
+from jaxsr.weights.file import into, save_weights
+from jaxsr.weights.names import PUBLISHED, method_of, translate
+from jaxsr.weights.torch import read_published
+
+SCALE = 4
+"""Where neither the shapes nor the caller tell."""
+
+
+def convert_published(
+    source: Path,
+    out: Path,
+    method: str | None = None,
+    *,
+    scale: int | None = None,
+    buffers: Sequence[str] | None = None,
+    half: bool = False,
+) -> dict[str, Any]:
+    """Write the weights that `source` holds under published names to `out`, a file that `jaxsr` can use.
+
+    Args:
+        source: `.pth`, `.npz` or `.safetensors`; nothing in it is executed.
+        out: ends in `.safetensors`; replaced if it exists.
+        method: that the weights are for; by default the names of the arrays tell. The variant of its network
+            is read off their shapes.
+        scale: that they were trained for, 4 by default; not needed where the shapes tell.
+        buffers: the G-buffer channels in the order of training, where they are not all in the paper's order.
+        half: store float16.
+
+    Returns:
+        The header of the file: "method", its "arguments", and more.
+
+    Raises:
+        JaxsrError: no such method, a file that cannot be read, or weights that do not fit the method.
+    """
+    if method is not None and method not in PUBLISHED:
+        raise JaxsrError(
+            f"no published weights of {method!r} are known",
+            where="--method",
+            expected="one of " + ", ".join(PUBLISHED),
+        )
+    if out.suffix != ".safetensors":
+        raise JaxsrError("bad name for a file of weights", where=out, expected="it to end in .safetensors")
+    published = read_published(source)
+    method = method or method_of(published, source)
+    arguments = PUBLISHED[method].arguments(published, buffers, source)
+    told = arguments.get("scale", scale or SCALE)
+    if scale not in (None, told):
+        raise JaxsrError("the weights are of another scale", where=source, expected=scale, found=told)
+    new_net = build(method, arguments).new_net
+    assert new_net is not None  # `build` knows only methods that learn
+    net = nnx.eval_shape(lambda: new_net(nnx.Rngs(0)))
+    state = into(nnx.state(net), translate(method, net, published, source), source)
+    header = {
+        "method": method,
+        "arguments": arguments,
+        "scale": told,
+        "jaxsr": jaxsr.__version__,
+        "source": {"file": source.name, "sha256": hashlib.sha256(source.read_bytes()).hexdigest()},
+    }
+    save_weights(out, state, header, half=half)
+    return header

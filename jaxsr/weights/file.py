@@ -1,0 +1,183 @@
+"""Weights as safetensors with a header: nothing in them is executed when they are loaded.
+
+A file holds one array a parameter or batch statistic, named by its place in the network
+("decoder1.up.kernel"), and one metadata entry, `jaxsr`: a JSON object with at least `method`, `arguments` and
+`scale`, from which `jaxsr.methods.build` makes the method again. Arrays are float32, or float16 at half the
+size; loaded, they are float32 either way. `jaxsr.weights.torch` reads the weights of other programs.
+"""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import jax.numpy as jnp
+import numpy as np
+from flax import nnx
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save
+
+from jaxsr.errors import JaxsrError
+from jaxsr.files import atomic_path
+
+State: TypeAlias = Any
+"""An `nnx.State`; not annotated as one, for its own annotations are of a kind that beartype rejects."""
+KEY = "jaxsr"
+"""Of the metadata entry that holds the header."""
+
+
+def flatten(state: State) -> dict[str, np.ndarray]:
+    """The arrays of a state by name, "a.b.c" for `state["a"]["b"]["c"]`."""
+    return {
+        ".".join(map(str, path)): np.asarray(variable.get_value())
+        for path, variable in nnx.to_flat_state(state)
+    }
+
+
+def save_weights(
+    path: str | Path,
+    state: State | Mapping[str, np.ndarray],
+    header: Mapping[str, Any],
+    half: bool = False,
+) -> None:
+    """Write a file of weights, atomically; the same weights and header give the same bytes.
+
+    Args:
+        path: of the file.
+        state: parameters and batch statistics, as a state or already by name.
+        header: JSON values; `method`, `arguments` and `scale`, and whatever else should be known of them.
+        half: store float16, rounded to nearest.
+
+    Raises:
+        JaxsrError: a value that is not finite, or beyond float16; a header that is no JSON; no permission.
+    """
+    dtype = np.float16 if half else np.float32
+    arrays = {}
+    for name, array in (flatten(state) if isinstance(state, nnx.State) else state).items():
+        with np.errstate(over="ignore"):  # told below, by name
+            arrays[name] = np.ascontiguousarray(array, dtype)
+        if not np.isfinite(arrays[name]).all():
+            raise JaxsrError(
+                f"{name} is not finite",
+                where=path,
+                expected=f"values within {dtype.__name__}",
+                found=_extreme(array),
+                fix="store float32"
+                if np.isfinite(array).all()
+                else "the training diverged: use earlier weights",
+            )
+    try:
+        text = json.dumps(dict(header), sort_keys=True, allow_nan=False)
+    except (TypeError, ValueError) as e:
+        raise JaxsrError("the header is no JSON", where=path, found=e) from e
+    blob = save(arrays, {KEY: text})
+    with atomic_path(Path(path)) as temporary:
+        temporary.write_bytes(blob)
+
+
+def load_weights(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read a file of weights.
+
+    Returns:
+        Arrays by name, float32, and the header.
+
+    Raises:
+        JaxsrError: missing, truncated, not safetensors, or without jaxsr's header.
+    """
+    path = Path(path)
+    arrays, metadata = read_safetensors(path)
+    try:
+        header = json.loads(metadata[KEY])
+    except KeyError:
+        header = None
+    except ValueError as e:
+        raise JaxsrError("the header of the weights is damaged", where=path, found=e) from e
+    if not isinstance(header, dict) or "method" not in header:
+        raise JaxsrError(
+            "the file does not say which method its weights are for",
+            where=path,
+            expected=f"a metadata entry {KEY!r} that names the method",
+            found=", ".join(sorted(metadata)) or "no metadata",
+            fix="convert published weights with `jaxsr convert-weights`",
+        )
+    return arrays, header
+
+
+def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Any safetensors file of floating-point arrays: those by name, as float32, and its metadata.
+
+    Raises:
+        JaxsrError: missing, truncated, not safetensors, or with arrays of types that NumPy does not know.
+    """
+    check_file(path)
+    try:
+        with safe_open(path, framework="np") as file:
+            metadata = file.metadata() or {}
+            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except SafetensorError as e:
+        raise JaxsrError(
+            "cannot read the weights", where=path, expected="a whole safetensors file", found=_words(e)
+        ) from e
+    except (TypeError, AttributeError) as e:  # bfloat16 and float8, which NumPy lacks
+        raise JaxsrError(
+            "cannot read the weights", where=path, expected="float16, float32 or float64", found=e
+        ) from e
+    return {name: np.asarray(array, np.float32) for name, array in arrays.items()}, metadata
+
+
+def check_file(path: Path) -> None:
+    """Raise JaxsrError unless there is a file of that name."""
+    if not path.is_file():
+        raise JaxsrError(
+            "no such file of weights" if not path.exists() else "a folder, not a file of weights", where=path
+        )
+
+
+def into(state: State, arrays: Mapping[str, np.ndarray], where: object = "weights") -> State:
+    """A state like `state`, with these arrays as its values.
+
+    Args:
+        state: of the network that the arrays are for; abstract (`nnx.eval_shape`) or concrete.
+        arrays: by name, as `load_weights` gives them.
+        where: what an error names: the file, perhaps, or the network.
+
+    Raises:
+        JaxsrError: arrays that are missing, too many, or of another shape; it names the first of them.
+    """
+    flat = {".".join(map(str, path)): (path, variable) for path, variable in nnx.to_flat_state(state)}
+    missing = [name for name in flat if name not in arrays]
+    extra = [name for name in arrays if name not in flat]
+    if missing or extra:
+        what = [f"{kind} {_few(names)}" for kind, names in (("lacks", missing), ("has", extra)) if names]
+        raise JaxsrError(
+            "the weights do not fit the network",
+            where=where,
+            expected=f"its {len(flat)} arrays",
+            found=f"a file of {len(arrays)} that " + " and ".join(what),
+            fix="choose weights, or arguments of the method, that belong together",
+        )
+    filled = []
+    for name, (path, variable) in flat.items():
+        old = variable.get_value()
+        if arrays[name].shape != old.shape:
+            raise JaxsrError(
+                f"{name} has another shape than in the network",
+                where=where,
+                expected=list(old.shape),
+                found=list(arrays[name].shape),
+                fix="choose weights, or arguments of the method, that belong together",
+            )
+        filled.append((path, variable.replace(jnp.asarray(arrays[name], old.dtype))))
+    return nnx.from_flat_state(filled)
+
+
+def _few(names: list[str]) -> str:
+    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+
+
+def _extreme(array: np.ndarray) -> object:
+    return np.max(np.abs(array)) if np.isfinite(array).all() else "NaN or infinity"
+
+
+def _words(error: Exception) -> str:
+    return str(error).removeprefix("Error while deserializing header: ") or type(error).__name__

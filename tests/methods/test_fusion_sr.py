@@ -1,0 +1,557 @@
+"""The method fusion-sr: normalisation, placement of samples, its step, its loss.
+
+Networks are drawn by NumPy and frames are tiny, but programs compile in seconds: what is compiled is shared.
+"""
+
+import functools
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import nnx
+
+from jaxsr.data import analytic
+from jaxsr.errors import JaxsrError
+from jaxsr.frames import Window
+from jaxsr.methods import METHODS, build, fusion_sr, guided, guided_taau, taau
+from jaxsr.methods._network import middle
+from jaxsr.methods.fusion_sr import Options, displayed, normalized_depth, sample_offset
+from jaxsr.nets import blocks as layers
+from jaxsr.ops import backward_warp, modulate, to_display, upsample, zero_upsample
+from tests.networks import drawn
+
+PAPER = {"color": "display", "start": "nothing", "follow_jitter": False}
+SIZE = (24, 16)
+
+VARIANTS = {
+    "default": {},
+    "paper": PAPER,
+    "unet": {"architecture": "unet", "down_kernel": 2} | PAPER,
+    "unet guided": {"architecture": "unet", "buffers": ("depth", "base_color")},
+    "concat display": {"fusion": "concat", "color": "display", "compute": "bfloat16"},
+    "add depth": {"fusion": "add", "buffers": ("depth",), "start": "nothing"},
+    "display depth": {"buffers": ("roughness", "depth"), "start": "nothing", "color": "display"},
+}
+
+
+@functools.cache
+def method_of(name):
+    return build("fusion-sr", VARIANTS[name])
+
+
+@functools.cache
+def state_of(name, seed=0):
+    return nnx.state(drawn(lambda rngs: method_of(name).new_net(rngs), seed))
+
+
+@functools.cache
+def step_of(name):
+    return jax.jit(method_of(name).step)
+
+
+def model_of(name):
+    graph = nnx.graphdef(nnx.eval_shape(lambda: method_of(name).new_net(nnx.Rngs(0))))
+    model = nnx.merge(graph, state_of(name))
+    model.eval()
+    return model
+
+
+@functools.cache
+def frame_at(t, size=SIZE, scale=2, rendered=True, jitter=None):
+    jitter = (0.3 - 0.2 * t, 0.1 * t - 0.4) if jitter is None else jitter
+    frame, truth = analytic.frame(t, size, scale, jitter, rendered=rendered)
+    cut = jnp.asarray(t == 0)
+    return jax.tree.map(jnp.asarray, frame)._replace(cut=cut), jnp.asarray(truth)
+
+
+def clip():
+    return [frame_at(t, rendered=t != 1)[0] for t in range(3)]
+
+
+def stream(name, frames):
+    """Images of the compiled step, one after the other."""
+    state, images = method_of(name).init(frames[0]), []
+    for frame in frames:
+        state, image = step_of(name)(state_of(name), state, frame)
+        images.append(np.asarray(image))
+    return images
+
+
+@functools.cache
+def streamed():
+    return stream("default", clip())
+
+
+def batched(*frames):
+    return jax.tree.map(lambda *xs: jnp.stack(xs), *frames)
+
+
+# Normalisation.
+
+
+def random_depth(seed=0, size=(9, 7)):
+    return jnp.asarray(np.exp(np.random.default_rng(seed).normal(1, 1, (*size, 1))), jnp.float32)
+
+
+def test_depth_is_free_of_the_scene_s_scale():
+    depth = random_depth().at[:2].set(jnp.inf)
+    found = normalized_depth(depth)
+    for scale in (1e-3, 100.0):
+        np.testing.assert_allclose(normalized_depth(scale * depth), found, atol=1e-6)
+    np.testing.assert_array_equal(found[:2], 1)
+    solid = np.asarray(depth[2:])
+    expected = 0.5 + np.log2(solid / np.exp(np.log(solid).mean())) / 16
+    np.testing.assert_allclose(found[2:], expected, atol=1e-6)
+
+
+def test_a_crop_shifts_depth_by_a_constant():
+    depth = random_depth(1).at[3, 3].set(jnp.inf)
+    solid = np.isfinite(np.asarray(depth[2:8, 1:5]))
+    shift = np.asarray(normalized_depth(depth)[2:8, 1:5] - normalized_depth(depth[2:8, 1:5]))[solid]
+    np.testing.assert_allclose(shift, shift[0], atol=1e-6)
+    assert abs(shift[0]) > 1e-4
+    batch = jnp.stack([depth, 3 * depth])  # each image has a mean of its own
+    np.testing.assert_allclose(normalized_depth(batch)[1], normalized_depth(depth), atol=1e-6)
+
+
+def test_depths_beyond_the_range_and_skies():
+    depth = jnp.array([1e-12, 1.0, 1.0, 1.0, 1.0, 1.0, 1e12, jnp.inf, 0.0, jnp.nan])[None, :, None]
+    found = np.asarray(normalized_depth(depth))[0, :, 0]
+    assert found[0] == 0
+    np.testing.assert_allclose(found[1:6], 0.5, atol=1e-6)
+    np.testing.assert_array_equal(found[6:], 1)
+    np.testing.assert_array_equal(normalized_depth(jnp.full((3, 2, 1), jnp.inf)), 1)  # nothing but sky
+
+
+def test_lighting_is_compressed_and_expanded():
+    lighting = jnp.array([0, 1e-6, 1e-3, 0.1, 1.0, 10.0, 400.0])
+    compressed = fusion_sr.compress_lighting(lighting)
+    assert (np.diff(compressed) > 0).all()
+    assert (compressed < 1).all()
+    np.testing.assert_allclose(fusion_sr.expand_lighting(compressed), lighting, rtol=2e-4, atol=1e-7)
+    np.testing.assert_allclose(fusion_sr.expand_lighting(jnp.array([1.0, 7.0])), 499.25, rtol=1e-4)
+    for function in (fusion_sr.compress_lighting, fusion_sr.expand_lighting):
+        slope = jax.vmap(jax.grad(function))(jnp.array([0.0, 0.5, 0.9995, 1.0, 3.0]))
+        assert np.isfinite(slope).all()
+
+
+@pytest.mark.parametrize("color", ["display", "lighting"])
+@pytest.mark.parametrize("exposure", [0.25, 3.0])
+def test_a_network_that_passes_colour_on_gives_the_colour(color, exposure):
+    """What the network sees is turned back into scene-linear colour by the inverse of the same map."""
+    options = Options(color=color, start="nothing")
+    frame, _ = frame_at(0)
+    enlarged = functools.partial(upsample, scale=2, mode="nearest")
+    flat = [jnp.asarray(np.random.default_rng(s).random((8, 12, 3), np.float32)) for s in (0, 1)]
+    linear = (2.0 / exposure) * flat[0]
+    frame = frame._replace(
+        color_linear=linear,
+        exposure=jnp.asarray(exposure),
+        lr=frame.lr._replace(base_color=flat[1].at[:2].set(0)),  # sky has no base colour
+        hr=frame.hr._replace(base_color=enlarged(flat[1].at[:2].set(0))),
+    )
+    shown, made = displayed(lambda c, g, o: enlarged(c), batched(frame), options)
+    np.testing.assert_allclose(made[0], enlarged(linear), rtol=2e-3, atol=1e-5)
+    np.testing.assert_allclose(shown[0], to_display(enlarged(linear), exposure), atol=2e-4)
+
+
+@pytest.mark.parametrize("options", [Options(), Options(**PAPER)])
+def test_the_inputs_are_those_of_exposed_colour(options):
+    frame, _ = frame_at(0)
+    unit = 1e4  # of radiance, as in candela a square metre
+    other = frame._replace(color_linear=frame.color_linear * unit, exposure=frame.exposure / unit)
+    for function in (fusion_sr.color_input, fusion_sr.starting_point)[: 1 + (options.start == "guided")]:
+        first, second = (function(f, options) for f in (frame, other))
+        np.testing.assert_allclose(first, second, atol=1e-4)
+        assert (np.asarray(first) >= 0).all()
+        assert (np.asarray(first) <= 1).all()
+
+
+def test_channels_are_in_order():
+    gbuffer = frame_at(0)[0].hr
+    found = fusion_sr.gbuffer_input(gbuffer, ("metallic", "normal", "depth"))
+    np.testing.assert_array_equal(found[..., :1], gbuffer.metallic)
+    np.testing.assert_array_equal(found[..., 1:4], gbuffer.normal)
+    np.testing.assert_array_equal(found[..., 4:], normalized_depth(gbuffer.depth_linear))
+    everything = fusion_sr.gbuffer_input(gbuffer, fusion_sr.BUFFERS)
+    assert np.isfinite(everything).all()
+    assert everything.min() >= -1
+    assert everything.max() <= 1
+
+
+# Where LR samples go.
+
+
+@pytest.mark.parametrize("scale", [1, 2, 3, 4])
+def test_offsets_are_the_nearest_pixel_of_the_block(scale):
+    jitters = np.linspace(-0.5, 0.5, 47)
+    found = np.asarray(sample_offset(jnp.asarray(np.stack([jitters, -jitters], -1), jnp.float32), scale))
+    for jitter, (x, y) in zip(jitters, found, strict=True):
+        for j, k in ((jitter, x), (-jitter, y)):
+            place = scale * (j + 0.5) - 0.5  # of LR pixel 0 among the HR pixels
+            distances = [abs(place - pixel) for pixel in range(scale)]
+            assert distances[k] <= min(distances) + 1e-5
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+def test_samples_lie_on_the_pixels_that_show_the_same(scale):
+    """Where jitter puts samples on HR pixels exactly, their buffers are those of the HR image."""
+    steps = (np.arange(scale) - (scale - 1) / 2) / scale
+    for jx, jy in zip(steps, np.roll(steps, 1), strict=True):
+        frame, _ = frame_at(0, scale=scale, jitter=(float(jx), float(jy)))
+        offset = sample_offset(frame.jitter_px, scale)
+        placed = zero_upsample(frame.lr.base_color, scale, offset)
+        there = np.asarray(zero_upsample(jnp.ones_like(frame.lr.depth_linear), scale, offset)) == 1
+        np.testing.assert_allclose(
+            np.where(there, placed, 0), np.where(there, frame.hr.base_color, 0), atol=1e-4
+        )
+
+
+def test_following_the_jitter_is_nearer_than_the_top_left():
+    errors = {True: [], False: []}
+    for t in range(8):
+        frame, _ = frame_at(0, scale=4, jitter=tuple((np.array([0.37, 0.71]) * (t + 1)) % 1 - 0.5))
+        for follows in errors:
+            offset = sample_offset(frame.jitter_px, 4) if follows else None
+            placed = zero_upsample(frame.lr.depth_linear, 4, offset)
+            there = np.isfinite(placed) & (np.asarray(placed) > 0) & np.isfinite(frame.hr.depth_linear)
+            off = np.abs(np.log(np.asarray(placed)[there] / np.asarray(frame.hr.depth_linear)[there]))
+            errors[follows].append(off.mean())
+    assert np.mean(errors[True]) < 0.5 * np.mean(errors[False])
+
+
+def test_the_network_is_told_the_offset():
+    seen = []
+
+    def net(color, gbuffer, offset):
+        seen.append(offset)
+        return jnp.zeros((*gbuffer.shape[:-1], 3))
+
+    frames = batched(*(frame_at(t, scale=4)[0] for t in range(2)))
+    displayed(net, frames, Options(start="nothing"))
+    displayed(net, frames, Options(start="nothing", follow_jitter=False))
+    np.testing.assert_array_equal(seen[0], [[3, 0], [2, 0]])
+    assert seen[1] is None
+
+
+# The step.
+
+
+def test_streaming_equals_scan():
+    frames = clip()
+    run = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(method_of("default").step, net), s, fs))
+    _, images = run(state_of("default"), method_of("default").init(frames[0]), batched(*frames))
+    np.testing.assert_allclose(np.stack(streamed()), images, rtol=2e-4, atol=2e-4)
+
+
+def test_jit_equals_eager():
+    frame = clip()[0]
+    with jax.disable_jit():
+        _, image = method_of("default").step(state_of("default"), method_of("default").init(frame), frame)
+    np.testing.assert_allclose(image, streamed()[0], rtol=1e-3, atol=1e-4)
+
+
+def test_an_extrapolated_frame_never_sees_its_colour():
+    frames = clip()
+    frames[1] = frames[1]._replace(color_linear=jnp.full_like(frames[1].color_linear, jnp.nan))
+    for image, expected in zip(stream("default", frames), streamed(), strict=True):
+        np.testing.assert_array_equal(image, expected)
+
+
+def test_it_extrapolates_by_guided_reprojection_of_its_output():
+    frames = clip()
+    history = taau.State(streamed()[0], jnp.ones((*SIZE[::-1], 1)), frames[0].hr.depth_linear)
+    state = guided.State(history, *guided.surface(frames[0].hr))
+    _, expected = guided.extrapolate(guided.Options(), state, frames[1])
+    np.testing.assert_allclose(streamed()[1], expected, rtol=1e-4, atol=1e-5)
+
+
+def test_it_extrapolates_by_plain_warping_without_guides():
+    frames = clip()[:2]
+    first, second = stream("add depth", frames)
+    np.testing.assert_allclose(second, backward_warp(first, frames[1].hr.motion_px), rtol=1e-4, atol=1e-5)
+
+
+def test_a_cut_drops_the_history():
+    frames = clip()
+    broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
+    after = frames[2]._replace(cut=jnp.asarray(True))
+    np.testing.assert_array_equal(stream("default", [broken, frames[1], after])[2], streamed()[2])
+
+
+def test_rendered_frames_need_no_history():
+    np.testing.assert_array_equal(stream("default", clip()[2:])[0], streamed()[2])
+
+
+def test_full_size_frames_pass_unchanged():
+    frame, truth = frame_at(0, scale=1, jitter=(0.0, 0.0))
+    method = method_of("default")
+    _, image = jax.jit(method.step)(state_of("default"), method.init(frame), frame)
+    np.testing.assert_array_equal(image, frame.color_linear)
+    np.testing.assert_allclose(image, truth, rtol=1e-6)
+
+
+def test_the_smallest_frame():
+    frame, _ = frame_at(0, (2, 2))
+    _, image = step_of("default")(state_of("default"), method_of("default").init(frame), frame)
+    assert image.shape == (2, 2, 3)
+    assert np.isfinite(image).all()
+
+
+@pytest.mark.parametrize(("size", "scale"), [((6, 2), 2), ((9, 3), 3), ((28, 20), 4), ((8, 24), 8)])
+def test_any_size_and_scale(size, scale):
+    frame, _ = frame_at(0, size, scale)
+    method = method_of("default")
+    _, image = jax.eval_shape(method.step, state_of("default"), method.init(frame), frame)
+    assert image.shape == (*size[::-1], 3)
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_variants_see_only_what_they_need(name):
+    """Buffers that are not asked for are not there; depth and motion every sequence has."""
+    method, frame = method_of(name), frame_at(0)[0]
+    for place in ("lr", "hr"):
+        gbuffer = getattr(frame, place)
+        names = ("normal", "base_color", "roughness", "metallic", "object_id")
+        absent = {k: None for k in names if f"{place}.{k}" not in method.needs}
+        frame = frame._replace(**{place: gbuffer._replace(**absent)})
+    _, image = jax.eval_shape(method.step, state_of(name), method.init(frame), frame)
+    assert image.shape == (*SIZE[::-1], 3)
+    assert image.dtype == jnp.float32
+    assert {"lr.color", "hr.motion"} <= method.needs
+
+
+@pytest.mark.parametrize("name", ["unet", "concat display"])
+def test_variants_run(name):
+    image = stream(name, clip()[:1])[0]
+    assert np.isfinite(image).all()
+    assert (image >= 0).all()
+    assert image.std() > 0
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_arguments_in_json_build_the_same_method(name):
+    method = method_of(name)
+    again = build("fusion-sr", json.loads(json.dumps(dict(method.arguments))))
+    assert again.arguments == method.arguments
+    assert again.needs == method.needs
+    assert Options(**again.arguments) == Options(**VARIANTS[name])
+    shapes = [
+        jax.tree.map(jnp.shape, nnx.state(nnx.eval_shape(lambda m=m: m.new_net(nnx.Rngs(0)))))
+        for m in (method, again)
+    ]
+    assert shapes[0] == shapes[1]
+
+
+@pytest.mark.parametrize(("architecture", "count"), [("fusion", 418_619), ("unet", 506_907)])
+def test_the_paper_s_form_has_the_paper_s_size(architecture, count):
+    method = build("fusion-sr", PAPER | {"architecture": architecture})
+    net = nnx.eval_shape(lambda: method.new_net(nnx.Rngs(0)))
+    assert sum(p.size for p in jax.tree.leaves(nnx.state(net, nnx.Param))) == count
+    assert method.needs == {"lr.color", "hr.motion"} | {f"hr.{k}" for k in fusion_sr.BUFFERS}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ({"buffers": ["depth", "estimate"]}, "unknown buffer 'estimate'"),
+        ({"buffers": []}, "buffers"),
+        ({"buffers": ["depth", "depth"]}, "buffers"),
+        (
+            {"color": "hdr"},
+            r"color: bad color; expected display \| lighting; found hdr",
+        ),
+        ({"start": "end"}, "start"),
+        ({"fusion": "product"}, "fusion"),
+        ({"architecture": "gan"}, "architecture"),
+        ({"down_kernel": 4}, "down_kernel"),
+        ({"compute": "float16"}, "compute"),
+        ({"buffers": 5}, "buffers: bad buffers; expected a list of names; found 5"),
+        ({"buffers": [1, 2]}, "buffers"),
+        ({"follow_jitter": "no"}, "follow_jitter: bad follow_jitter; expected true or false; found no"),
+        ({"perceptual_crop": "x"}, "perceptual_crop"),
+        ({"perceptual_crop": 15}, "perceptual_crop: bad perceptual_crop; expected at least 16, which LPIPS"),
+        ({"l1_weight": None}, "l1_weight"),
+        ({"perceptual_weight": -1.0}, "perceptual_weight"),
+        ({"perceptual_weight": float("nan")}, "perceptual_weight"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, match):
+    options = Options()  # tests alone check the types of what it is made from
+    for name, value in arguments.items():
+        object.__setattr__(options, name, tuple(value) if isinstance(value, list) else value)
+    with pytest.raises(JaxsrError, match=match):
+        fusion_sr.method(options)
+
+
+def test_arguments_of_another_version_are_named():
+    with pytest.raises(JaxsrError, match="has no argument 'colour'; expected architecture"):
+        build("fusion-sr", {"colour": "display"})
+
+
+def test_it_is_among_the_methods():
+    assert METHODS["fusion-sr"].arguments == method_of("default").arguments
+    assert METHODS["fusion-sr"].window == 1
+
+
+def test_untrained_it_is_the_guided_upsampling(monkeypatch):
+    draw = np.random.default_rng(0)
+
+    def numpy_init(key, shape, dtype=jnp.float32, **_):
+        return jnp.asarray(draw.normal(0, 0.1, shape), dtype)
+
+    monkeypatch.setattr(layers, "XAVIER", numpy_init)  # JAX's own compiles for every shape
+    net = nnx.state(method_of("default").new_net(nnx.Rngs(0)))
+    for t in range(2):
+        frame = frame_at(t)[0]._replace(exposure=jnp.asarray(1.5))
+        _, image = step_of("default")(net, method_of("default").init(frame), frame)
+        color = guided_taau.estimate(frame, guided_taau.Options()).color
+        estimate = taau.from_working(color, frame.exposure)
+        expected = modulate(estimate, frame.hr.base_color)
+        np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", ["default", "concat display"])
+def test_training_and_inference_make_the_same_picture(name):
+    """One batch of frames as training sees them, and each by itself as the step does."""
+    frames = [clip()[0], clip()[2]._replace(exposure=jnp.asarray(0.4))]
+    options = Options(**VARIANTS[name])
+    run = jax.jit(lambda net, frames: displayed(nnx.merge(graph, net), frames, options))
+    graph, net = nnx.split(model_of(name))
+    shown, linear = run(net, batched(*frames))
+    for i, frame in enumerate(frames):
+        _, image = step_of(name)(state_of(name), method_of(name).init(frame), frame)
+        tolerance = 0.02 if options.compute == "bfloat16" else 1e-4
+        np.testing.assert_allclose(linear[i], image, rtol=tolerance, atol=tolerance)
+        np.testing.assert_allclose(
+            jnp.clip(shown[i], 0, 1), to_display(image, frame.exposure), atol=max(tolerance, 2e-4)
+        )
+
+
+# The loss.
+
+
+def window(*frames_and_truths):
+    frames, truths = zip(*frames_and_truths, strict=True)
+    return Window(jax.tree.map(lambda x: x[:, None], batched(*frames)), jnp.stack(truths)[:, None])
+
+
+@functools.cache
+def training(name):
+    """Parameters, the rest, and one compiled update."""
+    options = VARIANTS[name] | {"perceptual_weight": 0.0, "l1_weight": 1.0}
+    method = build("fusion-sr", options)
+    net = drawn(lambda rngs: method.new_net(rngs))
+    last = net.decoder1.convs.conv2
+    if options.get("start") != "nothing":
+        last.kernel[...], last.bias[...] = 0.1 * last.kernel[...], jnp.full_like(last.bias[...], 0.5)
+    graph, params, rest = nnx.split(net, nnx.Param, ...)
+    optimizer = optax.adam(2e-3)
+
+    @jax.jit
+    def update(params, rest, opt, window):
+        def loss(params):
+            net = nnx.merge(graph, params, rest, copy=True)
+            total, parts = method.loss(net, window)
+            return total, (parts, nnx.state(net, nnx.Param, ...)[1])
+
+        (total, (parts, new)), gradient = jax.value_and_grad(loss, has_aux=True)(params)
+        with jax.numpy_dtype_promotion("standard"):  # optax mixes integers with floats
+            updates, opt = optimizer.update(gradient, opt)
+        return optax.apply_updates(params, updates), new, opt, (total, parts, gradient)
+
+    return params, rest, optimizer.init(params), update
+
+
+def test_residuals_may_begin_at_zero():
+    def scales(**options):
+        net = fusion_sr.method(fusion_sr.Options(**options)).new_net(nnx.Rngs(0))
+        return [float(jnp.max(jnp.abs(fusion.norm2.scale[...]))) for fusion in net.fusions]
+
+    assert scales() == [1, 1, 1]
+    assert scales(residual="zero") == [0, 0, 0]
+    fusion_sr.method(fusion_sr.Options(residual="zero", fusion="concat")).new_net(nnx.Rngs(0))  # has none
+
+
+def test_the_loss_falls_on_one_window():
+    params, rest, opt, update = training("default")
+    seen = window(frame_at(0), frame_at(2))
+    totals = []
+    for _ in range(30):
+        params, rest, opt, (total, parts, _) = update(params, rest, opt, seen)
+        totals.append(float(total))
+    assert float(total) == pytest.approx(float(parts["ssim"] + parts["l1"]), rel=1e-5)
+    assert min(totals[-5:]) < 0.85 * totals[0]
+
+
+def hard_frames():
+    """Pictures that are all sky, black, or far too bright."""
+    frame, truth = frame_at(0)
+
+    def sky(gbuffer):
+        nothing = {k: jnp.zeros_like(getattr(gbuffer, k)) for k in ("normal", "base_color", "roughness")}
+        return gbuffer._replace(depth_linear=jnp.full_like(gbuffer.depth_linear, jnp.inf), **nothing)
+
+    return {
+        "sky": (frame._replace(lr=sky(frame.lr), hr=sky(frame.hr)), truth),
+        "black": (frame._replace(color_linear=0 * frame.color_linear), 0 * truth),
+        "bright": (frame._replace(color_linear=1e6 * frame.color_linear), 1e6 * truth),
+        "negative": (frame._replace(color_linear=frame.color_linear - 1), truth),
+    }
+
+
+@pytest.mark.parametrize("kind", ["sky", "black", "bright", "negative"])
+def test_loss_and_gradients_are_finite(kind):
+    params, rest, opt, update = training("default")
+    _, new, _, (total, _, gradient) = update(params, rest, opt, window(frame_at(1), hard_frames()[kind]))
+    assert np.isfinite(total)
+    for path, leaf in jax.tree_util.tree_leaves_with_path((gradient, new)):
+        assert np.isfinite(leaf).all(), path
+    assert any(np.abs(leaf).max() > 0 for leaf in jax.tree.leaves(gradient))
+
+
+@pytest.mark.parametrize("kind", ["sky", "black", "bright"])
+def test_hard_frames_give_finite_pictures(kind):
+    frame, _ = hard_frames()[kind]
+    _, image = step_of("default")(state_of("default"), method_of("default").init(frame), frame)
+    assert np.isfinite(image).all()
+    assert (np.asarray(image) >= 0).all()
+
+
+def test_the_loss_is_its_parts_on_displayed_colour(monkeypatch):
+    """The last frame of the window, exposed; LPIPS of the middle alone, with its weight."""
+    seen = []
+
+    def fake(pred, target):
+        seen.append((pred, target))
+        return jnp.mean(jnp.abs(pred - target))
+
+    monkeypatch.setattr("jaxsr.methods._network.lpips", fake)
+    options = Options(start="nothing", color="display", perceptual_crop=12, l1_weight=0.5)
+    (frame, truth), (other, wrong) = frame_at(0), frame_at(1)
+    frame = frame._replace(exposure=jnp.asarray(0.5))
+    frames = jax.tree.map(lambda a, b: jnp.stack([a, b])[None], other, frame)
+
+    class Nearest(nnx.Module):
+        def __call__(self, color, gbuffer, offset):
+            return upsample(color, 2, "nearest")
+
+    net = Nearest()
+    total, parts = fusion_sr.loss_of(options)(net, Window(frames, jnp.stack([wrong, truth])[None]))
+    target = to_display(truth, 0.5)
+    np.testing.assert_allclose(seen[0][1][0], target[2:14, 6:18], atol=1e-6)
+    assert seen[0][0].shape == (1, 12, 12, 3)
+    made = upsample(to_display(frame.color_linear, 0.5), 2, "nearest")
+    assert float(parts["l1"]) == pytest.approx(float(jnp.mean(jnp.abs(made - target))), rel=1e-4)
+    expected = parts["ssim"] + 0.5 * parts["l1"] + 0.2 * parts["lpips"]
+    assert float(total) == pytest.approx(float(expected), rel=1e-6)
+
+
+def test_the_middle():
+    image = jnp.arange(2 * 5 * 8 * 1.0).reshape(2, 5, 8, 1)
+    np.testing.assert_array_equal(middle(image, 4), image[:, 0:4, 2:6])
+    np.testing.assert_array_equal(middle(image, 6), image[:, :, 1:7])
+    np.testing.assert_array_equal(middle(image, 99), image)
