@@ -28,7 +28,7 @@ from flax import nnx
 
 from benchmarks import _common
 from benchmarks._common import Inputs, Prepared, Variant
-from jaxsr.frames import Camera, Frame, GBuffer, Window
+from jaxsr.frames import Camera, Frame, GBuffer, Scale, Window
 from jaxsr.methods import Method, fusion_sr
 from jaxsr.nets import FusionSR
 from jaxsr.nets import vgg as perceptual
@@ -283,7 +283,7 @@ def window_of(inputs: Inputs) -> Window:
     zero = np.zeros((BATCH, 2), np.float32)
     flags = np.ones(BATCH, bool)
     camera = Camera(np.broadcast_to(np.eye(4, dtype=np.float32), (BATCH, 4, 4)), zero + 1, zero)
-    frame = Frame(color, buffers(color), buffers(truth), zero, camera, flags, flags, zero[:, 0] + 1)
+    frame = Frame(color, buffers(color), buffers(truth), zero, camera, flags, flags, zero[:, 0] + 1, Scale(4))
     return jax.tree.map(lambda x: np.asarray(x)[:, None], Window(frame, truth))
 
 

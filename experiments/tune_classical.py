@@ -259,7 +259,7 @@ def main(config: Config) -> None:
     with tempfile.TemporaryDirectory() as temporary:
         sequences = training_sequences(config, Path(temporary))
         if config.what == "reprojection":
-            pairs = [Pair(s, i) for s in sequences for i in range(1, len(s)) if not s.infos[i].cut]
+            pairs = [Pair(s, i) for s in sequences for i in range(1, len(s)) if not s.infos[i].reset]
             result = tune_reprojection(pairs)
         else:
             result = tune_taau(sequences, config.rounds)

@@ -10,17 +10,25 @@ Motion is backward, in pixels of its own image, and knows nothing of jitter: `p_
 Jitter J is in pixels of the low-resolution (LR) image, in [-0.5, 0.5]. The jittered image shows at p what
 the unjittered one has at p + J: `I_J(p) = I_N(p + J)`. High-resolution (HR) buffers are not jittered.
 
-Colour is scene-linear and unbounded. Depth is linear view depth (distance along the viewing axis), +inf
-for sky. Normals are unit vectors in world space, zero for sky. Base colour is 0 for sky.
+Colour is scene-linear and unbounded, with the primaries of Rec. 709. Depth is linear view depth (distance
+along the viewing axis), above 0, +inf for sky; nothing else says what is sky. Normals are unit vectors in
+world space, zero for sky. Base colour is 0 for sky, and may be 0 on a surface as well.
 
 View space: x right, y down, z forward. World space: whatever the scene has, right-handed.
 
 Names carry the unit or the space where there is doubt: `motion_px`, `depth_linear`, `color_linear`.
+`LAYERS` is the table of all buffers.
 """
 
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
+
+from jaxsr.layers import FIELDS, LAYERS, Layer
+
+__all__ = ["FIELDS", "LAYERS", "Camera", "Frame", "GBuffer", "Layer", "Scale", "Window", "surface"]
 
 
 class Camera(NamedTuple):
@@ -39,10 +47,14 @@ class Camera(NamedTuple):
 
 
 class GBuffer(NamedTuple):
-    """What a rasteriser knows about each pixel before shading. A buffer that was not exported is None."""
+    """What a rasteriser knows about each pixel before shading.
 
-    depth_linear: Float[Array, "*b h w 1"]
-    motion_px: Float[Array, "*b h w 2"]
+    A buffer that was not exported, or that the method does not need, is None. Depth and motion are typed as
+    if they were always there, since nearly all code that reads them has asked for them.
+    """
+
+    depth_linear: Float[Array, "*b h w 1"] = None  # type: ignore[assignment]
+    motion_px: Float[Array, "*b h w 2"] = None  # type: ignore[assignment]
     normal: Float[Array, "*b h w 3"] | None = None
     base_color: Float[Array, "*b h w 3"] | None = None
     roughness: Float[Array, "*b h w 1"] | None = None
@@ -51,11 +63,17 @@ class GBuffer(NamedTuple):
     """Whole numbers; 0 for sky."""
 
 
+@jax.tree_util.register_static
+class Scale(int):
+    """HR size divided by LR size. It is part of a pytree's structure, so that compiled code knows it."""
+
+
 class Frame(NamedTuple):
     """All that a method may see of one frame. The truth is not part of it.
 
     `color_linear` is zero where `rendered` is False: such a frame has only its G-buffers and must be
-    extrapolated. The HR size is a whole multiple of the LR size; at scale 1 the two G-buffers are equal.
+    extrapolated. At scale 1 the two G-buffers are equal. `jaxsr.Frame.of` makes a frame of the arrays that
+    one has, and says what is wrong with them.
     """
 
     color_linear: Float[Array, "*b h w 3"]
@@ -66,26 +84,48 @@ class Frame(NamedTuple):
     """Unjittered, at the size of the output."""
     jitter_px: Float[Array, "*b 2"]
     """J of this frame, in LR pixels."""
-    camera: Camera
-    cut: Bool[Array, "*b"]
+    camera: Camera | None
+    """None where it is not known."""
+    reset: Bool[Array, "*b"]
     """True where this frame does not continue the one before it: history must be dropped."""
     rendered: Bool[Array, "*b"]
     """False where the frame was never shaded."""
     exposure: Float[Array, "*b"]
     """Factor on linear colour before the display tone map."""
+    factor: Scale = Scale(1)
+    """HR size divided by LR size, for the pytree; `scale` is the plain number."""
 
     @property
     def scale(self) -> int:
         """HR size divided by LR size."""
-        return self.hr.depth_linear.shape[-3] // self.color_linear.shape[-3]
+        return int(self.factor)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(H, W) of the output."""
+        height, width = self.color_linear.shape[-3:-1]
+        return height * self.scale, width * self.scale
+
+    @property
+    def exposed(self) -> Float[Array, "*b h w 3"]:
+        """Colour times exposure."""
+        return self.color_linear * self.exposure[..., None, None, None]
 
 
 class Window(NamedTuple):
     """Consecutive frames, or crops of them, with their truth: what training sees and inference never does.
 
-    A batch of windows has `[B, T]` in front of the shapes of one frame; the last frame is the one to make.
+    A batch of windows has `[B, T]` in front of the shapes of one frame. The truth is that of the M frames
+    that are to be made, in the order of time.
     """
 
     frames: Frame
     truth_linear: Float[Array, "*b H W 3"]
-    """HR colour of each frame, scene-linear, not jittered."""
+    """`[B, M, H, W, 3]`: HR colour, scene-linear, not jittered."""
+    lr_truth_linear: Float[Array, "*b h w 3"] | None = None
+    """`[B, M, h, w, 3]`: LR colour, jittered, of the same frames; None where it is not asked for."""
+
+
+def surface(depth_linear: Float[Array, "*b h w 1"]) -> Bool[Array, "*b h w 1"]:
+    """True where a pixel shows a surface, False for sky."""
+    return jnp.isfinite(depth_linear)

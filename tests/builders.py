@@ -29,9 +29,9 @@ def halton_jitter(index: int) -> tuple[float, float]:
     return tuple(radical_inverse(index % 32 + 1, base) - 0.5 for base in (2, 3))
 
 
-def frame_info(index: int, size: tuple[int, int], *, cut: bool = False, **camera: Any) -> FrameInfo:
+def frame_info(index: int, size: tuple[int, int], *, reset: bool = False, **camera: Any) -> FrameInfo:
     view = analytic.camera(index, size, **camera)
-    return FrameInfo(index, halton_jitter(index), cut, view.world_from_view, view.tan_half_fov)
+    return FrameInfo(index, halton_jitter(index), reset, view.world_from_view, view.tan_half_fov)
 
 
 def make_sequence(
@@ -57,7 +57,7 @@ def make_sequence(
     head: dict[str, Any] = {"name": path.name, "size": size, "scales": scales, "license": "CC0-1.0"} | writer
     with SequenceWriter(path, **head) as out:
         for index in range(1, frames + 1):
-            info = frame_info(index, size, cut=index == 1, still=still)
+            info = frame_info(index, size, reset=index == 1, still=still)
             images = {"hr": analytic.render(index, size, still=still, frozen=frozen)}
             for s in scales:
                 small = (size[0] // s, size[1] // s)
@@ -70,7 +70,7 @@ def make_sequence(
                 if spoil is not None:
                     spoil(name, index, layers)
             stated = FrameInfo(
-                index, jitter(info.jitter_px), info.cut, info.world_from_view, info.tan_half_fov
+                index, jitter(info.jitter_px), info.reset, info.world_from_view, info.tan_half_fov
             )
             out.write_frame(stated, images["hr"], {s: images[f"x{s}"] for s in scales})
     return Sequence.open(path)

@@ -146,7 +146,7 @@ def render(
         done = [
             f
             for f in range(first, last + 1)
-            if writer.has(f) and not (f > first and writer.is_cut(f) and not writer.has(f - 1))
+            if writer.has(f) and not (f > first and writer.is_reset(f) and not writer.has(f - 1))
         ]
         key = {**job, "threads": None, "attended": None, "described": described}
         raw = _raw_folder(out / ".raw", json.dumps(key, sort_keys=True))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Camera, Frame, GBuffer
+from jaxsr.frames import Camera, Frame, GBuffer, Scale
 
 _SUN = np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])
 
@@ -259,7 +259,7 @@ def frame(
     """One `Frame` of HR `size` with its truth `[H, W, 3]`; an unrendered frame has no colour.
 
     Args:
-        time: the number of the frame; 0 is a cut.
+        time: the number of the frame; 0 is a reset.
         size: (width, height) of the HR image, whole multiples of `scale`.
         scale: HR size divided by LR size.
         jitter_px: J in LR pixels.
@@ -290,9 +290,10 @@ def frame(
         hr=gbuffer(hr),
         jitter_px=jitter,
         camera=view,
-        cut=flags[0],
+        reset=flags[0],
         rendered=flags[1],
         exposure=flags[2],
+        factor=Scale(scale),
     )
     return result, hr["color"]
 

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Camera, Frame, GBuffer, Window
+from jaxsr.frames import Camera, GBuffer, Window
 
 _WORLD = np.array([-1, 1, 1])
 
@@ -58,10 +58,11 @@ def crop(window: Window, x: int, y: int, size: tuple[int, int]) -> Window:
     # (ndc' + 1) (w, h) / 2 + (x, y) = (ndc + 1) (W, H) / 2, put into ndc + shift = (x, y) / (z tan).
     part = np.array([w / width, h / height])
     offset = np.array([(2 * x + w - width) / w, (2 * y + h - height) / h])
-    camera = frames.camera._replace(
-        tan_half_fov=frames.camera.tan_half_fov * part,
-        lens_shift=frames.camera.lens_shift / part + offset,
-    )
+    camera = frames.camera
+    if camera is not None:
+        camera = camera._replace(
+            tan_half_fov=camera.tan_half_fov * part, lens_shift=camera.lens_shift / part + offset
+        )
     return Window(
         frames._replace(
             color_linear=cut_out(scale)(frames.color_linear),
@@ -88,22 +89,21 @@ def flip(window: Window, *, horizontal: bool = False, vertical: bool = False) ->
     def buffers(g: GBuffer) -> GBuffer:
         g = jax.tree.map(mirrored, g)
         return g._replace(
-            motion_px=_signed(g.motion_px, image),
+            motion_px=None if g.motion_px is None else _signed(g.motion_px, image),
             normal=None if g.normal is None else _signed(g.normal, world),
         )
 
-    matrix = frames.camera.world_from_view * np.outer([*world, 1], [*view, 1]).astype(float)
     camera = frames.camera
+    if camera is not None:
+        matrix = camera.world_from_view * np.outer([*world, 1], [*view, 1]).astype(float)
+        camera = Camera(matrix, camera.tan_half_fov, _signed(camera.lens_shift, image))
     return Window(
-        Frame(
+        frames._replace(
             color_linear=mirrored(frames.color_linear),
             lr=buffers(frames.lr),
             hr=buffers(frames.hr),
             jitter_px=_signed(frames.jitter_px, image),
-            camera=Camera(matrix, camera.tan_half_fov, _signed(camera.lens_shift, image)),
-            cut=frames.cut,
-            rendered=frames.rendered,
-            exposure=frames.exposure,
+            camera=camera,
         ),
         mirrored(window.truth_linear),
     )

@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxsr.data.cache import Arrays, Progress, open_arrays
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Camera, Frame, GBuffer, Window
+from jaxsr.frames import Camera, Frame, GBuffer, Scale, Window
 from jaxsr.io.sequence import Sequence as Clip
 from jaxsr.io.writing import LAYERS
 
@@ -103,7 +103,7 @@ class WindowSource:
         lr, hr = self._arrays[k]
         infos = clip.infos[frames]
         jitter: Any = np.array([info.jitter_px for info in infos], float) * (self.scale > 1)
-        flags: Any = (np.array([info.cut for info in infos]), np.ones(len(infos), bool))
+        flags: Any = (np.array([info.reset for info in infos]), np.ones(len(infos), bool))
         exposure: Any = np.full(len(infos), clip.exposure)
         camera = {name: np.array([getattr(info, name) for info in infos], float) for name in Camera._fields}
         low, high = self._images(lr, "lr", frames), self._images(hr, "hr", frames)
@@ -116,9 +116,10 @@ class WindowSource:
                 hr=GBuffer(**high),
                 jitter_px=jitter,
                 camera=Camera(**camera),  # type: ignore[arg-type]
-                cut=flags[0],
+                reset=flags[0],
                 rendered=flags[1],
                 exposure=exposure,
+                factor=Scale(self.scale),
             ),
             hr.layers["color"][frames],  # type: ignore[arg-type]
         )
@@ -151,7 +152,7 @@ def stack(windows: Sequence[Window]) -> Window:
 
 def _starts(clip: Clip, length: int, held_back: int) -> list[int]:
     frames = max(len(clip) - held_back, 0)
-    cuts = [k for k, info in enumerate(clip.infos[:frames]) if info.cut and k] + [frames]
+    cuts = [k for k, info in enumerate(clip.infos[:frames]) if info.reset and k] + [frames]
     starts = [i for i in range(frames) if i + length <= next(c for c in cuts if c > i)]
     if not starts:
         longest = max(b - a for a, b in itertools.pairwise([0, *cuts]))

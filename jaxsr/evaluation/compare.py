@@ -161,7 +161,7 @@ def _starts(truth: Frames) -> list[bool]:
     steps = np.diff(truth.numbers)
     found = [True, *(bool(s != steps.min()) for s in steps)]
     if (truth.folder / "sequence.json").is_file():
-        cuts = {info.index for info in FrameSequence.open(truth.folder).infos if info.cut}
+        cuts = {info.index for info in FrameSequence.open(truth.folder).infos if info.reset}
         found = [start or n in cuts for start, n in zip(found, truth.numbers, strict=True)]
     return found
 

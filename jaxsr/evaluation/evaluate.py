@@ -63,7 +63,7 @@ def part(sequence: FrameSequence, frames: tuple[int, int] | None) -> FrameSequen
             found=f"{frames[0]}:{frames[1]}",
         )
     found = copy.copy(sequence)
-    found.infos = [dataclasses.replace(infos[0], cut=True), *infos[1:]]
+    found.infos = [dataclasses.replace(infos[0], reset=True), *infos[1:]]
     return found
 
 

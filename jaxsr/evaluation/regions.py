@@ -45,7 +45,7 @@ def edges(gbuffer: GBuffer) -> Bool[np.ndarray, "h w"]:
 
 def disocclusions(frame: Frame, previous: Frame | None) -> Bool[np.ndarray, "h w"]:
     """What the HR frame shows and the previous one did not; see `REGIONS`."""
-    if previous is None or bool(frame.cut):
+    if previous is None or bool(frame.reset):
         return np.zeros(frame.hr.depth_linear.shape[:2], bool)
     valid = disocclusion_mask(frame.hr, previous.hr, frame.camera, previous.camera)
     return np.asarray(valid)[..., 0] == 0

@@ -179,7 +179,7 @@ def run_method(
                     expected=truth.image.shape,
                     found=image.shape,
                 )
-        meter.add([image for _, image in waiting], truths, [sequence.infos[i].cut for i, _ in waiting])
+        meter.add([image for _, image in waiting], truths, [sequence.infos[i].reset for i, _ in waiting])
         for _ in waiting:
             advance()
         waiting.clear()

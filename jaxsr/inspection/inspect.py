@@ -93,7 +93,7 @@ def inspect(
                 continue
             layers[resolution][i] = images[resolution].keys()
         _single(sequence, i, images, evidence)
-        if last is not None and last[0] == i - 1 and not sequence.infos[i].cut:
+        if last is not None and last[0] == i - 1 and not sequence.infos[i].reset:
             _pair(sequence, i, images, last[1], evidence)
             if "hr" in images and "hr" in last[1]:
                 pairs.append((i, images["hr"]))

@@ -41,7 +41,7 @@ def _images(
 ) -> Iterator[tuple[FrameInfo, FrameInfo, str, tuple[float, float]]]:
     """(frame, the one before, resolution, jitter) of every image, in the order of the archive."""
     for k, info in enumerate(infos):
-        before = infos[k - 1] if k and not info.cut else info
+        before = infos[k - 1] if k and not info.reset else info
         for resolution in resolutions:
             yield info, before, resolution, (0.0, 0.0) if resolution == "hr" else info.jitter_px
 

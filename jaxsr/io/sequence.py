@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Frame, GBuffer
+from jaxsr.frames import Frame, GBuffer, Scale
 from jaxsr.io.exr import read_exr, read_exr_header
 from jaxsr.io.geometry import world_position
 from jaxsr.io.writing import FORMAT, LAYERS, VERSION, FrameInfo, SequenceWriter, frame_file
@@ -62,7 +62,7 @@ class Sequence:
         head = _read_head(path)
         infos = [frame_info(entry, k, path / "sequence.json") for k, entry in enumerate(head["frames"])]
         for a, b in itertools.pairwise(infos):
-            if b.index <= a.index or (b.index != a.index + 1 and not b.cut):
+            if b.index <= a.index or (b.index != a.index + 1 and not b.reset):
                 raise JaxsrError(
                     f"frame {b.index} follows frame {a.index}",
                     where=path / "sequence.json",
@@ -114,9 +114,10 @@ class Sequence:
             hr=_gbuffer(hr),
             jitter_px=np.asarray(jitter, np.float32),  # type: ignore[arg-type]
             camera=info.camera,
-            cut=np.asarray(info.cut),  # type: ignore[arg-type]
+            reset=np.asarray(info.reset),  # type: ignore[arg-type]
             rendered=np.asarray(rendered),  # type: ignore[arg-type]
             exposure=np.asarray(self.exposure, np.float32),  # type: ignore[arg-type]
+            factor=Scale(scale),
         )
 
     def truth(self, i: int) -> Float[np.ndarray, "H W 3"]:
@@ -343,7 +344,7 @@ def frame_info(entry: Any, k: int, where: str | Path) -> FrameInfo:
         info = FrameInfo(
             index=index,
             jitter_px=tuple(np.asarray(entry["jitter_px"], float).reshape(2).tolist()),
-            cut=bool(entry["cut"]),
+            reset=bool(entry["cut"]),
             world_from_view=np.asarray(camera["world_from_view"], float).reshape(4, 4),
             tan_half_fov=tuple(np.asarray(camera["tan_half_fov"], float).reshape(2).tolist()),
             lens_shift=tuple(np.asarray(camera.get("lens_shift", [0, 0]), float).reshape(2).tolist()),

@@ -43,10 +43,10 @@ class FrameInfo:
     """What `sequence.json` knows of one frame. See `jaxsr.frames` for the conventions."""
 
     index: int
-    """Number of the frame, and name of its files; consecutive unless `cut`."""
+    """Number of the frame, and name of its files; consecutive unless `reset`."""
     jitter_px: Any
     """(x, y): J in LR pixels, the same numbers for every scale."""
-    cut: bool
+    reset: bool
     """True where the frame does not continue the one before it."""
     world_from_view: Any
     """`[4, 4]`, view space x right, y down, z forward."""
@@ -71,7 +71,7 @@ class FrameInfo:
             "lens_shift": np.asarray(self.lens_shift, float).tolist(),
         }
         jitter = [float(x) for x in self.jitter_px]
-        return {"index": int(self.index), "jitter_px": jitter, "cut": bool(self.cut), "camera": camera}
+        return {"index": int(self.index), "jitter_px": jitter, "cut": bool(self.reset), "camera": camera}
 
 
 def frame_file(folder: Path, resolution: str, index: int) -> Path:
@@ -171,7 +171,7 @@ class SequenceWriter:
             frame_file(self.path, r, index).exists() for r in self.resolutions
         )
 
-    def is_cut(self, index: int) -> bool:
+    def is_reset(self, index: int) -> bool:
         """Whether the frame is listed as one that does not continue the one before it."""
         return bool(self._frames.get(index, {}).get("cut"))
 
@@ -184,7 +184,7 @@ class SequenceWriter:
         """Write one frame, replacing it if it is there.
 
         Args:
-            info: index, jitter, cut and camera.
+            info: index, jitter, reset and camera.
             hr: layer -> `[H, W, C]` (or `[H, W]`), unjittered; None is left out.
             lr: scale -> layer -> `[h, w, C]`, jittered; one for each scale above 1.
 

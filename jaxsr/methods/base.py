@@ -23,9 +23,10 @@ class Method(NamedTuple):
     """A name, two pure functions and a list of needs.
 
     `step(net, state, frame) -> state, image` makes the HR linear colour of one frame; it serves streaming,
-    `jax.lax.scan`, evaluation and export alike. It never sees the truth. Where `frame.cut` is set it ignores
-    the state; where `frame.rendered` is not, it extrapolates and ignores `frame.color_linear`. Nothing can be
-    made of a frame that is both cut and not rendered: who schedules the frames renders the first of a shot.
+    `jax.lax.scan`, evaluation and export alike. It never sees the truth. Where `frame.reset` is set it
+    ignores the state; where `frame.rendered` is not, it extrapolates and ignores `frame.color_linear`.
+    Nothing can be made of a frame that is both a reset and not rendered: whoever schedules the frames renders
+    the first one of a shot.
     """
 
     name: str
@@ -53,7 +54,7 @@ def by_rendered(
     """A step that upscales rendered frames, extrapolates the others, and starts anew at a cut."""
 
     def step(net: Net, state: State, frame: Frame) -> tuple[State, Array]:
-        state = jax.tree.map(lambda new, old: jnp.where(frame.cut, new, old), init(frame), state)
+        state = jax.tree.map(lambda new, old: jnp.where(frame.reset, new, old), init(frame), state)
         return jax.lax.cond(frame.rendered, upscale, extrapolate, net, state, frame)
 
     return step

@@ -21,11 +21,11 @@ def rendered_schedule(sequence: Sequence, every: int) -> list[bool]:
     """
     if every < 1:
         raise JaxsrError("bad interval", where="every", expected="a whole number from 1", found=every)
-    rendered, since_cut = [], 0
+    rendered, since_reset = [], 0
     for info in sequence.infos:
-        since_cut = 0 if info.cut else since_cut
-        rendered.append(since_cut % every == 0)
-        since_cut += 1
+        since_reset = 0 if info.reset else since_reset
+        rendered.append(since_reset % every == 0)
+        since_reset += 1
     return rendered
 
 
@@ -54,7 +54,7 @@ def check_needs(method: Method, sequence: Sequence, scale: int) -> None:
             found=", ".join(sorted(have)),
             fix="export these buffers, or choose a method that does without (jaxsr inspect lists them)",
         )
-    if "hr.motion" in method.needs and len(sequence) > 1 and not sequence.infos[1].cut:
+    if "hr.motion" in method.needs and len(sequence) > 1 and not sequence.infos[1].reset:
         before, after = (np.asarray(info.world_from_view) for info in sequence.infos[:2])
         motion = np.asarray(sequence.frame(1, scale, rendered=False).hr.motion_px)
         if not motion.any() and not np.allclose(before, after, atol=1e-6):

@@ -44,7 +44,7 @@ def stream(method: Method, frames: Iterable[Frame], net: Net = None) -> Iterator
             if not bool(host_frame.rendered):
                 raise JaxsrError("the first frame is not rendered", fix="start at a rendered frame")
             # Nothing came before the first frame, wherever the clip was cut from.
-            host_frame = host_frame._replace(cut=jnp.asarray(True))
+            host_frame = host_frame._replace(reset=jnp.asarray(True))
         frame = jax.device_put(host_frame)
         if step is None:
             shape = jax.tree.map(np.shape, frame)

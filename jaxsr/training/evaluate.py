@@ -110,11 +110,11 @@ class Evaluator:
     def _run(self, net: Any, frames: Any) -> tuple[np.ndarray, np.ndarray]:
         """The last frame as the step makes it, HR linear; and its LR colour."""
         state = None
-        for t in range(frames.cut.shape[0]):
+        for t in range(frames.reset.shape[0]):
             frame = jax.tree.map(lambda x, t=t: x[t], frames)
             if state is None:
                 # The window begins in the middle of a shot; the step must not miss what came before.
-                frame = frame._replace(cut=np.asarray(True))
+                frame = frame._replace(reset=np.asarray(True))
                 state = self._init(frame)
             state, image = self._step(net, state, frame)
         return np.asarray(image), frame.color_linear

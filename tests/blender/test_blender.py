@@ -236,7 +236,7 @@ def test_ranges_rendered_one_after_the_other_are_joined(tmp_path, imitation):
 
     def cuts(first, last):
         seq = Sequence.open(render(scene, out, (first, last), scales=(), blender=imitation))
-        return {i.index: i.cut for i in seq.infos}
+        return {i.index: i.reset for i in seq.infos}
 
     assert cuts(3, 6) == {3: True, 4: False, 5: True, 6: False}
     before = (out / "hr" / "0004.exr").stat().st_mtime_ns
@@ -312,7 +312,7 @@ CUBE, PLANE = 1, 2  # objects in the order of their names: cube, plane, post
 @pytest.mark.blender
 def test_description(rendered):
     assert (rendered.size, rendered.scales, len(rendered)) == (SIZE, (2, 4), 4)
-    assert [i.cut for i in rendered.infos] == [True, False, False, False]
+    assert [i.reset for i in rendered.infos] == [True, False, False, False]
     assert rendered.exposure == 0.5
     assert rendered.generator["samples"] == 1 or rendered.generator["seed"] == 0
     for info, jitter in zip(rendered.infos, jitter_sequence(32), strict=False):
@@ -490,7 +490,7 @@ def test_other_seed_changes_colour_only(rendered, tmp_path, program):
 @pytest.mark.blender
 def test_cameras_bound_to_markers_cut(tmp_path, program):
     seq = Sequence.open(render_scene(tmp_path / "seq", program, split="cut", scales=(2,)))
-    assert [i.cut for i in seq.infos] == [True, False, True, False]
+    assert [i.reset for i in seq.infos] == [True, False, True, False]
     np.testing.assert_allclose(seq.infos[2].world_from_view[:3, 3], [0, -9, 3], atol=1e-6)
     still = seq.frame(2, 1).lr
     assert np.abs(still.motion_px[still.object_id[..., 0] == PLANE]).max() < 1e-3, "that camera does not move"

@@ -221,7 +221,7 @@ def test_colours_and_flags_are_only_moved():
         a, b = getattr(mirrored.frames.lr, name), getattr(window.frames.lr, name)
         np.testing.assert_array_equal(a, b[:, :, ::-1])
         assert np.shares_memory(a, b)
-    np.testing.assert_array_equal(mirrored.frames.cut, window.frames.cut)
+    np.testing.assert_array_equal(mirrored.frames.reset, window.frames.reset)
 
 
 def test_absent_buffers_stay_absent():

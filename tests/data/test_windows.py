@@ -53,7 +53,7 @@ def test_windows_do_not_cross_cuts(tmp_path):
     jitters = [np.float32(w.frames.jitter_px).tolist() for w in map(source.__getitem__, range(len(source)))]
     expected = [(a, 0), (a, 1), (a, 3), (a, 4), (b, 0), (b, 1)]
     assert jitters == [[seq.frame(i + t, 2).jitter_px.tolist() for t in range(2)] for seq, i in expected]
-    assert [w.frames.cut.tolist() for w in map(source.__getitem__, (0, 1, 2, 4))] == [
+    assert [w.frames.reset.tolist() for w in map(source.__getitem__, (0, 1, 2, 4))] == [
         [True, False],
         [False, False],
         [True, False],

@@ -107,7 +107,7 @@ def test_doubling_the_rate_of_full_size_frames(tmp_path):
 
 def test_the_first_frame_of_a_shot_is_always_rendered(tmp_path):
     sequence = make_sequence(tmp_path / "seq", frames=5)
-    sequence.infos[1] = dataclasses.replace(sequence.infos[1], cut=True)
+    sequence.infos[1] = dataclasses.replace(sequence.infos[1], reset=True)
     assert rendered_schedule(sequence, 3) == [True, True, False, False, True]
     with pytest.raises(JaxsrError, match="every"):
         rendered_schedule(sequence, 0)

@@ -357,6 +357,6 @@ def test_other_refusals(data, tmp_path):
 def test_a_range_begins_anew(data):
     sequence = upscale.FrameSequence.open(data / "set" / "two")
     cut = evaluation.part(sequence, (2, 3))
-    assert [(info.index, info.cut) for info in cut.infos] == [(2, True), (3, False)]
-    assert not sequence.infos[1].cut
+    assert [(info.index, info.reset) for info in cut.infos] == [(2, True), (3, False)]
+    assert not sequence.infos[1].reset
     assert cut.infos[1] is sequence.infos[2]

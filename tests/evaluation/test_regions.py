@@ -53,7 +53,7 @@ def test_disocclusions_are_what_was_hidden():
     assert np.mean(found == hidden) > 0.97
     assert np.mean(found[hidden]) > 0.9
     assert not disocclusions(frame, None).any()
-    assert not disocclusions(frame._replace(cut=np.asarray(True)), previous).any()
+    assert not disocclusions(frame._replace(reset=np.asarray(True)), previous).any()
 
 
 @pytest.mark.parametrize("scale", [1, 2])

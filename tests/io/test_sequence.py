@@ -44,7 +44,7 @@ def test_description(seq):
     assert (len(seq), seq.size, seq.scales, seq.fps, seq.exposure) == (3, SIZE, (2, 4), 24, 1)
     assert (seq.name, seq.license, seq.resolutions) == ("seq", "CC0-1.0", ("hr", "x2", "x4"))
     assert [i.index for i in seq.infos] == [1, 2, 3]
-    assert [i.cut for i in seq.infos] == [True, False, False]
+    assert [i.reset for i in seq.infos] == [True, False, False]
     assert set(seq.layers("x2")) == {
         "color", "depth", "motion", "normal", "base_color", "roughness", "metallic", "object_id", "position",
     }  # fmt: skip
@@ -70,7 +70,7 @@ def test_frames_come_back(seq, scale):
                 np.testing.assert_allclose(getattr(buffers, name), layers[name], **half)
         assert all(x.dtype == np.float32 for x in (frame.color_linear, *frame.lr, *frame.hr, frame.jitter_px))
         np.testing.assert_allclose(frame.jitter_px, jitter, atol=1e-7)
-        assert (bool(frame.cut), bool(frame.rendered)) == (i == 0, True)
+        assert (bool(frame.reset), bool(frame.rendered)) == (i == 0, True)
         view = analytic.camera(index, SIZE)
         np.testing.assert_allclose(frame.camera.world_from_view, view.world_from_view, atol=1e-6)
 
@@ -267,7 +267,7 @@ def writer(path, **more):
 
 def test_a_killed_writer_resumes(tmp_path):
     first = writer(tmp_path)
-    first.write_frame(frame_info(1, SIZE, cut=True), layers(1), {2: layers(1, 2)})
+    first.write_frame(frame_info(1, SIZE, reset=True), layers(1), {2: layers(1, 2)})
     # Killed inside frame 2: HR is there, LR half-written under its temporary name.
     write_exr(tmp_path / "hr/0002.exr", {"depth.Z": np.zeros((24, 32), np.float32)})
     (tmp_path / "x2/.0002.exr.99-1.tmp").write_bytes(b"half")
@@ -344,7 +344,7 @@ def test_precision_and_special_values(tmp_path):
     ids = np.full((24, 32), 70000)
     color = np.full((24, 32, 3), 1e9)
     with writer(tmp_path, scales=(), precision={"motion": "half", "normal": "float"}) as out:
-        out.write_frame(frame_info(1, SIZE, cut=True), layers(object_id=ids, color=color), {})
+        out.write_frame(frame_info(1, SIZE, reset=True), layers(object_id=ids, color=color), {})
     channels, _ = read_exr(tmp_path / "hr/0001.exr")
     kinds = {name: channels[name].dtype for name in ("motion.X", "normal.X", "depth.Z", "object_id.V")}
     assert kinds == {"motion.X": "f2", "normal.X": "f4", "depth.Z": "f4", "object_id.V": "u4"}
@@ -375,7 +375,7 @@ def test_rounding_the_mantissa_shrinks_files(tmp_path):
 
 def test_frame_info_round_trip(seq):
     info = seq.infos[1]
-    again = FrameInfo(info.index, info.jitter_px, info.cut, info.world_from_view, info.tan_half_fov)
+    again = FrameInfo(info.index, info.jitter_px, info.reset, info.world_from_view, info.tan_half_fov)
     assert again.to_json() == json.loads((seq.path / "sequence.json").read_text())["frames"][1]
 
 
@@ -404,7 +404,7 @@ def test_prefetch_reads_ahead_in_order(seq):
 def test_prefetch_hands_errors_over(seq):
     (seq.path / "x2/0002.exr").unlink()
     frames = prefetch(seq.frame(i, 2) for i in range(3))
-    assert next(frames).cut
+    assert next(frames).reset
     with pytest.raises(JaxsrError, match="no such file"):
         next(frames)
 

@@ -62,11 +62,11 @@ def streamed(name):
     return stream(name, clip())[0]
 
 
-def window(frames_and_truths, cut=False):
+def window(frames_and_truths, reset=False):
     """One window, as training sees it: the past of its first frame was left out."""
     frames, truths = zip(*frames_and_truths, strict=True)
     frames = batched(*frames)
-    frames = frames._replace(cut=jnp.zeros_like(frames.cut).at[0].set(cut))
+    frames = frames._replace(reset=jnp.zeros_like(frames.reset).at[0].set(reset))
     return Window(*jax.tree.map(lambda x: x[None], (frames, jnp.stack(truths))))
 
 
@@ -178,7 +178,7 @@ def test_an_extrapolated_frame_is_the_last_picture_warped(name):
 def test_a_cut_drops_the_history(name):
     frames = clip()
     broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
-    after = [frames[2]._replace(cut=jnp.asarray(True)), frames[3]]
+    after = [frames[2]._replace(reset=jnp.asarray(True)), frames[3]]
     alone, _ = stream(name, after)
     assert_same(stream(name, [broken, frames[1], *after])[0][2:], alone)
 
@@ -361,7 +361,7 @@ def test_windows_leave_out_the_past(tmp_path):
     source = WindowSource(
         [tmp_path / "clip"], scale=2, needs=method_of("rrn").needs, length=3, cache=tmp_path / "cache"
     )
-    cuts = np.stack([stack([source[i]]).frames.cut[0] for i in range(len(source))])
+    cuts = np.stack([stack([source[i]]).frames.reset[0] for i in range(len(source))])
     np.testing.assert_array_equal(cuts, [[True, False, False], [False] * 3, [False] * 3])
 
 

@@ -64,7 +64,7 @@ def frame_at(t, size=SIZE, scale=2, rendered=True, jitter=None):
     jitter = (0.3 - 0.2 * t, 0.1 * t - 0.4) if jitter is None else jitter
     frame, truth = analytic.frame(t, size, scale, jitter, rendered=rendered)
     cut = jnp.asarray(t == 0)
-    return jax.tree.map(jnp.asarray, frame)._replace(cut=cut), jnp.asarray(truth)
+    return jax.tree.map(jnp.asarray, frame)._replace(reset=cut), jnp.asarray(truth)
 
 
 def clip():
@@ -278,7 +278,7 @@ def test_it_extrapolates_by_plain_warping_without_guides():
 def test_a_cut_drops_the_history():
     frames = clip()
     broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
-    after = frames[2]._replace(cut=jnp.asarray(True))
+    after = frames[2]._replace(reset=jnp.asarray(True))
     np.testing.assert_array_equal(stream("default", [broken, frames[1], after])[2], streamed()[2])
 
 

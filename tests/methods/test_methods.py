@@ -33,7 +33,7 @@ def clip(scale: int, count: int, every: int = 1, still: bool = False) -> tuple[l
             frame = frame._replace(
                 hr=frame.hr._replace(motion_px=none(frame.hr.motion_px)),
                 lr=frame.lr._replace(motion_px=none(frame.lr.motion_px)),
-                cut=np.asarray(t == 0),
+                reset=np.asarray(t == 0),
             )
         frames.append(frame)
         truths.append(truth)
@@ -91,7 +91,7 @@ def test_an_extrapolated_frame_never_sees_its_colour(name):
 def test_a_cut_drops_the_history(name):
     frames, _ = clip(2, 4)
     alone = [made.image for made in stream(METHODS[name], frames[3:])]
-    broken = [frames[0], frames[1], frames[3]._replace(cut=np.asarray(True))]
+    broken = [frames[0], frames[1], frames[3]._replace(reset=np.asarray(True))]
     # Even a broken history must not reach through a cut.
     broken[1] = broken[1]._replace(color_linear=np.full_like(broken[1].color_linear, np.nan))
     after = [made.image for made in stream(METHODS[name], broken)]
@@ -117,7 +117,7 @@ def test_a_grey_world_stays_grey(name, every):
 @pytest.mark.parametrize("name", NAMES)
 def test_full_size_frames_pass_unchanged(name):
     frame, truth = analytic.frame(0, SIZE, 1, (0.0, 0.0))
-    for made in stream(METHODS[name], [frame, frame._replace(cut=np.asarray(False))]):
+    for made in stream(METHODS[name], [frame, frame._replace(reset=np.asarray(False))]):
         np.testing.assert_allclose(made.image, truth, rtol=1e-6)
 
 
@@ -167,7 +167,9 @@ def test_taau_history_does_not_bleed_across_a_silhouette():
     image = jnp.broadcast_to(jnp.where(left, 1.0, 5.0), (h, w, 3))
     state = taau.State(image, jnp.ones((h, w, 1)), depth)
     motion = jnp.full((h, w, 2), 0.5)
-    here = frame._replace(hr=frame.hr._replace(depth_linear=depth, motion_px=motion), cut=jnp.asarray(False))
+    here = frame._replace(
+        hr=frame.hr._replace(depth_linear=depth, motion_px=motion), reset=jnp.asarray(False)
+    )
     history, weight = taau.fetch_history(state.image, state.weight, state.depth_linear, here, taau.Options())
     right_edge = history[1:, w // 2]  # its left tap lies on the near surface
     np.testing.assert_allclose(right_edge, 5.0, rtol=1e-6)

@@ -222,7 +222,7 @@ def frame_at(t, size=SIZE, scale=2, rendered=True):
     jitter = tuple(float((a * (t + 1)) % 1 - 0.5) for a in (0.37, 0.71))
     frame, truth = analytic.frame(t, size, scale, jitter, rendered=rendered)
     cut, exposure = jnp.asarray(t == 0), jnp.asarray(1 + 0.1 * t, jnp.float32)
-    return jax.tree.map(jnp.asarray, frame)._replace(cut=cut, exposure=exposure), jnp.asarray(truth)
+    return jax.tree.map(jnp.asarray, frame)._replace(reset=cut, exposure=exposure), jnp.asarray(truth)
 
 
 def clip(count=5, unrendered=(), **options):
@@ -352,7 +352,7 @@ def test_the_state_keeps_its_size(name):
 def test_after_a_cut_nothing_is_remembered():
     frames = clip()
     broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
-    again = [frame._replace(cut=jnp.asarray(t == 0)) for t, frame in enumerate(frames[2:])]
+    again = [frame._replace(reset=jnp.asarray(t == 0)) for t, frame in enumerate(frames[2:])]
     alone, after = stream("default", again), stream("default", [broken, frames[1], *again])[2:]
     for (state, image), (other, expected) in zip(after, alone, strict=True):
         np.testing.assert_array_equal(image, expected)

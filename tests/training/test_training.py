@@ -308,11 +308,11 @@ def test_a_window_is_history(data):
     seen = []
 
     def step(net, state, frame):
-        jax.debug.callback(lambda cut, n: seen.append((bool(cut), int(n))), frame.cut, state)
+        jax.debug.callback(lambda cut, n: seen.append((bool(cut), int(n))), frame.reset, state)
         return state + 1, jnp.ones_like(frame.hr.base_color)
 
     method = tiny_method.method(window=3)._replace(
-        init=lambda frame: jnp.where(frame.cut, jnp.int32(0), jnp.int32(-1)), step=step
+        init=lambda frame: jnp.where(frame.reset, jnp.int32(0), jnp.int32(-1)), step=step
     )
     shared = {"scale": 2, "held_back": 1, "cache": data.parent / "cache", "needs": method.needs, "window": 3}
     found = loop.Evaluator(method, [data / "clip"], **shared)(None)

@@ -1,0 +1,60 @@
+"""The table of layers: what a buffer is called, measured in, stored as, and what it holds for sky.
+
+One row per layer drives reading, writing, archives, inspection, training data and the inputs of networks. It
+needs neither JAX nor NumPy, so that a renderer's own Python can import it; `jaxsr.frames` offers it as well.
+A new buffer is one row here and one field of `jaxsr.frames.GBuffer`.
+"""
+
+import math
+from typing import Literal, NamedTuple
+
+
+class Layer(NamedTuple):
+    """One row: a buffer of an image, or its colour."""
+
+    name: str
+    """In files and on command lines: `motion`."""
+    letters: str
+    """One per channel: the file has `motion.X` and `motion.Y`."""
+    field: str
+    """Of `GBuffer` in memory: `motion_px`; of `Frame` for the colour; empty where no frame carries it."""
+    unit: str
+    """Unit and space, in words."""
+    low: float
+    high: float
+    """Smallest and largest value that can be meant."""
+    stored: Literal["half", "float", "uint"]
+    """How a writer stores it unless it is told otherwise."""
+    sky: float | None
+    """Its value where there is no surface; None where sky has one of its own."""
+
+
+_ROWS = (
+    Layer("color", "RGB", "color_linear", "scene-linear colour", -math.inf, math.inf, "half", None),
+    Layer("depth", "Z", "depth_linear", "linear view depth", 0.0, math.inf, "float", math.inf),
+    Layer("motion", "XY", "motion_px", "backward, pixels of its image", -math.inf, math.inf, "float", None),
+    Layer("normal", "XYZ", "normal", "unit vector, world space", -1.0, 1.0, "half", 0.0),
+    Layer("base_color", "RGB", "base_color", "linear", 0.0, 1.0, "half", 0.0),
+    Layer("roughness", "V", "roughness", "", 0.0, 1.0, "half", 0.0),
+    Layer("metallic", "V", "metallic", "", 0.0, 1.0, "half", 0.0),
+    Layer("object_id", "V", "object_id", "whole number", 0.0, float(2**32 - 1), "half", 0.0),
+    Layer("position", "XYZ", "", "world space", -math.inf, math.inf, "float", 0.0),
+)
+
+LAYERS: dict[str, Layer] = {layer.name: layer for layer in _ROWS}
+"""By name, in the order of files."""
+
+FIELDS: dict[str, str] = {
+    layer.name: layer.field for layer in _ROWS if layer.field not in ("", "color_linear")
+}
+"""Layer -> field of `GBuffer`."""
+
+
+def channels(name: str) -> tuple[str, ...]:
+    """The channels of a layer in a file: `("motion.X", "motion.Y")`."""
+    return tuple(f"{name}.{letter}" for letter in LAYERS[name].letters)
+
+
+def needed(places: frozenset[str], place: str) -> frozenset[str]:
+    """The layers that a set of needs such as `{"lr.color", "hr.motion"}` names for "lr" or "hr"."""
+    return frozenset(need.partition(".")[2] for need in places if need.startswith(f"{place}."))
