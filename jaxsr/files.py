@@ -1,15 +1,190 @@
-"""Files that appear whole or not at all, and what killed writers leave behind."""
+"""Files that appear whole or not at all, bounded reading of small files, digests.
+
+Whatever lies at a path that a user names may be a folder, a named pipe, or something far too large. The
+readers here answer each of these with one `JaxsrError`, never with a hang or with all of the memory.
+"""
 
 import contextlib
+import hashlib
+import json
 import os
 import re
+import stat
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from io import BufferedReader
 from pathlib import Path
+from typing import Any
 
 from jaxsr.errors import JaxsrError
 
+JSON_BYTES = 32 << 20
+"""Largest JSON text that is read: ten thousand frames of a sequence need about half of it."""
+JSON_DEPTH = 64
+"""Deepest nesting of JSON that is read; the deepest that jaxsr writes is about 8."""
+_INTEGER_DIGITS = 40  # 128 bits, as the states of random generators have
 _TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp")
+_KINDS = (
+    (stat.S_ISFIFO, "a named pipe"),
+    (stat.S_ISSOCK, "a socket"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+)
+
+
+# --- reading ---------------------------------------------------------------------------------------------
+
+
+def open_file(path: str | Path) -> BufferedReader:
+    """Open a regular file for reading bytes; never waits, as opening a named pipe would.
+
+    Raises:
+        JaxsrError: nothing there, a folder, a pipe or a device, or no permission.
+    """
+    try:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0))
+    except IsADirectoryError:  # Windows: it opens no folders
+        raise JaxsrError("is a folder", where=path, expected="a file") from None
+    except FileNotFoundError:
+        raise JaxsrError("no such file", where=path) from None
+    except (OSError, ValueError) as e:
+        if Path(path).is_dir():
+            raise JaxsrError("is a folder", where=path, expected="a file") from None
+        raise JaxsrError("cannot be read", where=path, found=getattr(e, "strerror", None) or e) from e
+    mode = os.fstat(descriptor).st_mode
+    if stat.S_ISREG(mode):
+        return os.fdopen(descriptor, "rb")
+    os.close(descriptor)
+    if stat.S_ISDIR(mode):
+        raise JaxsrError("is a folder", where=path, expected="a file")
+    found = next((name for test, name in _KINDS if test(mode)), "something else")
+    raise JaxsrError("is not a regular file", where=path, expected="a file", found=found)
+
+
+def read_bytes(path: str | Path, limit: int = JSON_BYTES) -> bytes:
+    """All bytes of a regular file that has at most `limit` of them.
+
+    Raises:
+        JaxsrError: as `open_file`; too large; a failing disk.
+    """
+    with open_file(path) as file:
+        try:
+            data = file.read(limit + 1)
+            size = os.fstat(file.fileno()).st_size
+        except OSError as e:
+            raise JaxsrError("cannot be read", where=path, found=e.strerror or e) from e
+    if len(data) > limit:
+        raise JaxsrError(
+            "the file is too large", where=path, expected=f"at most {limit} bytes", found=max(size, len(data))
+        )
+    return data
+
+
+def read_json(path: str | Path, kind: type | None = None, limit: int = JSON_BYTES) -> Any:
+    """The value in a JSON file: `parse_json` of `read_bytes`.
+
+    Args:
+        path: a regular file of UTF-8 text.
+        kind: `dict` or `list`, where only that is right.
+        limit: bytes of the file at most.
+
+    Raises:
+        JaxsrError: as `read_bytes` and `parse_json`.
+    """
+    return parse_json(read_bytes(path, limit), path, kind, limit)
+
+
+def parse_json(text: str | bytes, where: object, kind: type | None = None, limit: int = JSON_BYTES) -> Any:
+    """The value of a JSON text, in bounded time and memory.
+
+    NaN, Infinity, numbers that overflow to them (1e999) and integers of more than 40 digits are refused, so
+    that callers only have to check ranges.
+
+    Args:
+        text: the text, or its bytes in UTF-8 (with or without a byte order mark).
+        where: file or place that errors name.
+        kind: `dict` or `list`, where only that is right.
+        limit: length of the text at most.
+
+    Raises:
+        JaxsrError: not UTF-8, not JSON, nested deeper than `JSON_DEPTH`, too long, a number that is refused,
+            or another kind of value.
+    """
+    if len(text) > limit:
+        raise JaxsrError("the JSON is too long", where=where, expected=f"at most {limit}", found=len(text))
+    try:
+        decoded = text.decode("utf-8-sig") if isinstance(text, bytes) else text.removeprefix("\ufeff")
+        value = json.loads(
+            decoded, parse_constant=_refuse_constant, parse_float=_finite_float, parse_int=_short_int
+        )
+    except RecursionError:
+        raise _too_deep(where) from None
+    except UnicodeDecodeError as e:
+        raise JaxsrError("the text is not UTF-8", where=where, found=e.reason) from e
+    except ValueError as e:  # JSONDecodeError, and the refusals below
+        raise JaxsrError("bad JSON", where=where, found=e) from e
+    _check_depth(value, where)
+    if "\\u" in decoded:
+        try:
+            json.dumps(value, ensure_ascii=False).encode()
+        except UnicodeEncodeError as e:  # half of a pair, which no file or terminal can show
+            raise JaxsrError("bad JSON", where=where, found="an incomplete \\u escape") from e
+    if kind is not None and not isinstance(value, kind):
+        names: dict[type, str] = {dict: "an object {...}", list: "a list [...]"}
+        found = type(value).__name__
+        raise JaxsrError("bad JSON", where=where, expected=names.get(kind, kind.__name__), found=found)
+    return value
+
+
+def _refuse_constant(text: str) -> float:
+    raise ValueError(f"{text}, where a finite number is needed")
+
+
+def _finite_float(text: str) -> float:
+    value = float(text)
+    if value - value != 0:
+        raise ValueError(f"{text[:40]}, which is too large")
+    return value
+
+
+def _short_int(text: str) -> int:
+    if len(text) > _INTEGER_DIGITS:
+        raise ValueError(f"an integer of {len(text)} digits")
+    return int(text)
+
+
+def _check_depth(value: Any, where: object) -> None:
+    level: list[Any] = [value]
+    for _ in range(JSON_DEPTH + 1):
+        inner = (x for x in level if isinstance(x, dict | list))
+        level = [y for x in inner for y in (x.values() if isinstance(x, dict) else x)]
+        if not level:
+            return
+    raise _too_deep(where)
+
+
+def _too_deep(where: object) -> JaxsrError:
+    return JaxsrError("the JSON is nested too deep", where=where, expected=f"at most {JSON_DEPTH} levels")
+
+
+# --- digests ---------------------------------------------------------------------------------------------
+
+
+def file_digest(path: str | Path) -> str:
+    """SHA-256 of a regular file, in hexadecimal digits; the file is never whole in memory."""
+    with open_file(path) as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def digest(parts: Iterable[bytes]) -> str:
+    """SHA-256 over the SHA-256 of each part, so that bytes cannot move from one part to the next."""
+    whole = hashlib.sha256()
+    for part in parts:
+        whole.update(hashlib.sha256(part).digest())
+    return whole.hexdigest()
+
+
+# --- writing ---------------------------------------------------------------------------------------------
 
 
 @contextlib.contextmanager

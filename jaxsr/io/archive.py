@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path, remove_leftovers
+from jaxsr.files import atomic_path, file_digest, remove_leftovers
 from jaxsr.io.archive_coding import decode_frame, encode_frame
 from jaxsr.io.exr import read_exr
 from jaxsr.io.sequence import Sequence, check_head, frame_info
@@ -95,11 +95,6 @@ def pack(
     with atomic_path(archive.with_name(archive.name + ".sha256")) as temporary:
         temporary.write_text(f"{digest}  {archive.name}\n")
     return digest
-
-
-def file_digest(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def read_manifest(archive: Path) -> dict[str, Any]:
