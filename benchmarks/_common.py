@@ -7,7 +7,6 @@ far a fresh process's resident size rises while it runs the variant, results inc
 
 import argparse
 import contextlib
-import importlib.metadata
 import json
 import os
 import platform
@@ -25,6 +24,9 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+
+from jaxsr.files import write_text
+from jaxsr.provenance import commit, device_kind, versions
 
 RESULTS = Path(__file__).parent / "results"
 SIZES = ("480x270", "960x540", "1920x1080")
@@ -218,51 +220,23 @@ def _write(name: str, references: dict[str, str], rows: list[dict[str, Any]], ro
     lines += ["|---|---|---|---|---|---|---|---|", *map(_row, rows)]
     RESULTS.mkdir(exist_ok=True)
     stem = f"{name}-{_slug(about['device'])}"
-    _replace(RESULTS / f"{stem}.json", json.dumps({"about": about, "rows": rows}, indent=1) + "\n")
-    _replace(RESULTS / f"{stem}.md", "\n".join(lines) + "\n")
+    write_text(RESULTS / f"{stem}.json", json.dumps({"about": about, "rows": rows}, indent=1) + "\n")
+    write_text(RESULTS / f"{stem}.md", "\n".join(lines) + "\n")
     print(f"wrote {RESULTS / stem}.json and .md")
 
 
 def environment() -> dict[str, Any]:
     """Device, versions, commit, date."""
-    versions = {}
-    for package in PACKAGES:
-        try:
-            versions[package] = importlib.metadata.version(package)
-        except importlib.metadata.PackageNotFoundError:
-            versions[package] = "not installed"
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"],
-        capture_output=True,
-        text=True,
-        check=False,
-        cwd=Path(__file__).parent,
-    ).stdout.strip()
-    device = jax.devices()[0]
     return {
-        "device": _cpu() if device.platform == "cpu" else device.device_kind,
+        "device": device_kind(),
         "cores": len(os.sched_getaffinity(0)),
         "load": round(os.getloadavg()[0], 2),
         "python": platform.python_version(),
-        "versions": versions,
-        "commit": commit,
+        "versions": dict.fromkeys(PACKAGES, "not installed") | versions(PACKAGES),
+        "commit": commit(),
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
     }
 
 
-def _cpu() -> str:
-    try:
-        found = re.search(r"model name\s*:\s*(.+)", Path("/proc/cpuinfo").read_text())
-    except OSError:
-        found = None
-    return found.group(1).strip() if found else platform.processor() or platform.machine()
-
-
 def _slug(text: str) -> str:
     return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")
-
-
-def _replace(path: Path, text: str) -> None:
-    temporary = path.with_suffix(path.suffix + ".tmp")
-    temporary.write_text(text)
-    temporary.replace(path)

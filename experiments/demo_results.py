@@ -8,7 +8,6 @@ truth). LPIPS is among the metrics if the extra `perceptual` is installed.
 """
 
 import json
-import platform
 import sys
 import tempfile
 import time
@@ -32,7 +31,6 @@ from jaxsr.report.tables import as_json, best, cell, duration, header, summary
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-from experiments.provenance import commit  # noqa: E402
 
 RESULTS = ROOT / "experiments" / "results"
 IMAGES = ROOT / "docs" / "images"
@@ -194,10 +192,7 @@ def main(config: Config) -> None:
         for task in LABELS:
             shown = [s for s in sections if s.meta["scale"] == (4 if task == "super-resolution" else 2)]
             pictures[task] = picture(shown, task, config.frame)
-    state = commit()
     meta = description(
-        commit=state,
-        processor=platform.processor() or platform.machine(),
         seconds=round(time.time() - start),
         seed="none: nothing is random",
         script="experiments/demo_results.py",
@@ -208,8 +203,8 @@ def main(config: Config) -> None:
         document = as_json(sections, title="demo", meta=meta)
         temporary.write_text(json.dumps(document, indent=1) + "\n")
     lines = [
-        f"Measured by `experiments/demo_results.py` at {state} on {meta['date']} ({meta['device']}, jax "
-        f"{meta['jax']}): mean ± standard deviation over frames. Display-referred colour, no crop.",
+        f"Measured by `experiments/demo_results.py` at {meta['commit']} on {meta['date']} ({meta['device']}, "
+        f"jax {meta['jax']}): mean ± standard deviation over frames. Display-referred colour, no crop.",
         "",
     ]
     for task in LABELS:

@@ -16,7 +16,6 @@ deterministic for a seed, whatever the number of threads.
 import json
 import math
 import os
-import platform
 import sys
 import tempfile
 import time
@@ -44,7 +43,6 @@ from rich.progress import (  # noqa: E402
 )
 
 from experiments import dataset_card  # noqa: E402
-from experiments.provenance import commit  # noqa: E402
 from jaxsr.blender import render as blender  # noqa: E402
 from jaxsr.blender.convert import convert_color  # noqa: E402
 from jaxsr.blender.process import BlenderProcess, find_blender  # noqa: E402
@@ -54,6 +52,7 @@ from jaxsr.io.archive import pack, read_manifest, unpack_sequence, verify  # noq
 from jaxsr.io.exr import read_exr  # noqa: E402
 from jaxsr.io.sequence import Sequence  # noqa: E402
 from jaxsr.ops.color import to_display  # noqa: E402
+from jaxsr.provenance import commit, machine  # noqa: E402
 
 SCENES = ("bunker", "forest", "docks")
 CLIP_FRAMES = 12
@@ -302,7 +301,7 @@ def add_cost(path: Path, cpu_seconds: float, wall_seconds: float) -> None:
     new = {
         "cpu_seconds": round(old["cpu_seconds"] + cpu_seconds, 1),
         "wall_seconds": round(old["wall_seconds"] + wall_seconds, 1),
-        "device": device(),
+        "device": machine(),
     }
     write_json(path, new)
 
@@ -310,15 +309,6 @@ def add_cost(path: Path, cpu_seconds: float, wall_seconds: float) -> None:
 def write_json(path: Path, value: Any) -> None:
     with atomic_path(path) as temporary:
         temporary.write_text(json.dumps(value, indent=1, default=str) + "\n")
-
-
-def device() -> str:
-    info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    model = next(
-        (line.split(":")[1].strip() for line in lines if line.startswith("model name")), platform.machine()
-    )
-    return f"{model}, {os.cpu_count()} cores"
 
 
 # --- noise floor -----------------------------------------------------------------------------------------
@@ -377,7 +367,7 @@ def measure_floor(config: Floor, console: Console) -> None:
                 "scene_sha256": described["scene_sha256"],
                 "seeds": config.seeds,
                 "commit": commit(),
-                "device": device(),
+                "device": machine(),
                 "seconds": round(time.monotonic() - start, 1),
                 "time": datetime.now(UTC).isoformat(timespec="seconds"),
             }

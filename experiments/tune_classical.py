@@ -17,7 +17,6 @@ the best PSNR asks for keeps still images steadier.
 """
 
 import json
-import platform
 import sys
 import tempfile
 import time
@@ -48,7 +47,6 @@ import matplotlib.pyplot as plt
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))
-from experiments.provenance import commit  # noqa: E402
 
 RESULTS = ROOT / "experiments" / "results"
 
@@ -263,11 +261,8 @@ def main(config: Config) -> None:
             result = tune_reprojection(pairs)
         else:
             result = tune_taau(sequences, config.rounds)
-    state = commit()
     meta = description(
         script=f"experiments/tune_classical.py {config.what}",
-        commit=state,
-        processor=platform.processor() or platform.machine(),
         seconds=round(time.time() - start),
         sequences=[f"{s.name}: {len(s)} frames {s.size[0]}x{s.size[1]}" for s in sequences],
         seed="none: the search is deterministic",
@@ -278,7 +273,7 @@ def main(config: Config) -> None:
     lines = [
         f"# Constants of {'guided reprojection' if config.what == 'reprojection' else 'TAAU'}",
         "",
-        f"`{meta['script']}` at {state} on {meta['date']}, {meta['device']}, {meta['seconds']} s; "
+        f"`{meta['script']}` at {meta['commit']} on {meta['date']}, {meta['device']}, {meta['seconds']} s; "
         f"training frames: {', '.join(meta['sequences'])}. PSNR of display colour, whole frames.",
         "",
         *report(config, result),

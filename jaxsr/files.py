@@ -203,6 +203,16 @@ def atomic_path(path: Path) -> Iterator[Path]:
             temporary.unlink(missing_ok=True)
 
 
+def write_text(path: Path, text: str) -> None:
+    """Write a text file in UTF-8, atomically.
+
+    Raises:
+        JaxsrError: it cannot be written.
+    """
+    with atomic_path(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
 def remove_leftovers(folder: Path) -> int:
     """Delete what killed writers left in `folder` (names that `atomic_path` gives); returns how many."""
     leftovers = [p for p in Path(folder).glob(".*.tmp") if _TEMPORARY.fullmatch(p.name)]

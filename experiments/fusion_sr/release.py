@@ -23,7 +23,6 @@ import tyro  # noqa: E402
 from tyro.conf import Positional  # noqa: E402
 
 from experiments.fusion_sr.train_released import Run, chosen  # noqa: E402
-from experiments.provenance import commit  # noqa: E402
 from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
@@ -85,7 +84,7 @@ def release(name: str, run: Run, weights: Path, head: dict[str, Any]) -> None:
             title=name,
             progress=progress,
         )
-    meta = description(commit=commit(), weights=weights.name)
+    meta = description(weights=weights.name)
     results = as_json(sections, title=name, meta=meta)
     write(RESULTS / f"{name}.json", json.dumps(results, indent=1) + "\n")
     write(CARDS / f"{name}.md", card(name, run, head, sections, weights))

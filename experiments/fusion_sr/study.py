@@ -33,7 +33,6 @@ import tyro  # noqa: E402
 from tyro.conf import Positional  # noqa: E402
 
 from experiments.make_datasets import CACHE, Render, clips_of  # noqa: E402
-from experiments.provenance import commit  # noqa: E402
 from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
@@ -179,7 +178,7 @@ def measure(ready: LoadedMethod, clips: list[Path], frames: Path) -> dict[str, A
                 "metrics": track.metrics,
                 "regions": track.regions,
             }
-    measured = description(commit=commit(), scale=SCALE, warm_up=WARM_UP)
+    measured = description(scale=SCALE, warm_up=WARM_UP)
     measured["seconds"] = round(time.monotonic() - begun, 1)
     return {"measured": measured, "cost": dataclasses.asdict(track.cost), "scenes": scenes}
 

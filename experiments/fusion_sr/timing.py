@@ -36,13 +36,13 @@ from flax import nnx  # noqa: E402
 from benchmarks._common import environment, summarise, time_interleaved  # noqa: E402
 from experiments.fusion_sr.study import RESULTS, VARIANTS, Variant  # noqa: E402
 from experiments.fusion_sr.tables import IMAGES, PAGE, on_page, write  # noqa: E402
-from experiments.make_datasets import SCENES, device  # noqa: E402
-from experiments.provenance import commit  # noqa: E402
+from experiments.make_datasets import SCENES  # noqa: E402
 from jaxsr.blender import render as blender  # noqa: E402
 from jaxsr.data import analytic  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.methods import METHODS  # noqa: E402
+from jaxsr.provenance import commit, machine  # noqa: E402
 from jaxsr.runtime.cost import count_parameters, multiply_adds_of  # noqa: E402
 
 SIZE, SCALE = (1920, 1080), 4
@@ -183,7 +183,7 @@ def render(
     if not runtime.is_file():
         raise JaxsrError("no time of the network", where=runtime, fix="run `timing.py methods` first")
     times = json.loads(runtime.read_text(encoding="utf-8"))
-    about = {"size": list(size), "scale": SCALE, "samples": samples, "device": device()}
+    about = {"size": list(size), "scale": SCALE, "samples": samples, "device": machine()}
     known = json.loads(file.read_text(encoding="utf-8")) if file.is_file() and not again else {}
     same = {key: known.get("about", {}).get(key) for key in about} == about
     found = dict(known["seconds"]) if same else {}

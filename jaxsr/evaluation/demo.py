@@ -1,18 +1,15 @@
 """`jaxsr demo`: the sample that ships with the package, upscaled and extrapolated, measured and shown."""
 
-import platform
-import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-import jaxsr
 from jaxsr.evaluation.measuring import Reference, metrics_with
 from jaxsr.evaluation.running import Settings, run_methods
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.provenance import provenance
 from jaxsr.report.embedding import to_bytes
 from jaxsr.report.page import write_report
 from jaxsr.report.results import SequenceResult
@@ -29,11 +26,7 @@ EXTRAPOLATORS = ("nearest", "bilinear", "taau", "guided", "guided-taau")
 def description(**settings: Any) -> dict[str, Any]:
     """What a result must carry: versions, device, date and settings."""
     return {
-        "jaxsr": jaxsr.__version__,
-        "jax": jax.__version__,
-        "device": f"{jax.devices()[0].device_kind}, {platform.machine()}",
-        "python": platform.python_version(),
-        "date": time.strftime("%Y-%m-%d"),
+        **provenance(),
         "display": "sRGB of the ACES tone map (Narkowicz fit) of exposure times linear colour; no crop",
         **settings,
     }

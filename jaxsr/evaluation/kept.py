@@ -4,24 +4,21 @@
 is long. A record without results, as an interrupted run leaves it, or with another key, is made anew.
 """
 
-import hashlib
-import importlib.metadata
 import importlib.resources
 import json
 import math
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import jax
 
 import jaxsr
 from jaxsr.evaluation.measuring import Reference
 from jaxsr.evaluation.running import Advance, Settings, check_folder, png_file, run_method
-from jaxsr.files import atomic_path
+from jaxsr.files import atomic_path, digest
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.metrics import available
+from jaxsr.provenance import device, versions
 from jaxsr.report.results import MethodResult, Timing
 from jaxsr.report.tables import json_value
 from jaxsr.runtime.cost import Cost
@@ -31,7 +28,6 @@ RECORD = "result.json"
 FOLDERS = ("exr", "png", "flip")
 NOT_CODE = ("cli.py", "training", "data", "report/page.py", "report/tables.py")
 """Of the package, what results do not depend on; who edits a method wants new ones."""
-PACKAGES = ("jax", "numpy", "dm-pix", "flip-evaluator")
 
 
 def run_kept(
@@ -76,23 +72,16 @@ def _key(
     code = [file for name, file in names if not name.startswith(NOT_CODE)]
     return {
         "jaxsr": jaxsr.__version__,
-        "packages": {name: importlib.metadata.version(name) for name in PACKAGES},
-        "device": jax.devices()[0].device_kind,
-        "code": _digest(file.read_bytes() for file in code),
+        "packages": versions(),
+        "device": device(),
+        "code": digest(file.read_bytes() for file in code),
         "method": ready.method.name,
-        "weights": None if ready.weights is None else _digest([ready.weights.read_bytes()]),
-        "sequence": _digest([(sequence.path / "sequence.json").read_bytes(), *(s.encode() for s in listing)]),
+        "weights": None if ready.weights is None else digest([ready.weights.read_bytes()]),
+        "sequence": digest([(sequence.path / "sequence.json").read_bytes(), *(s.encode() for s in listing)]),
         "frames": [info.index for info in sequence.infos],
         "settings": settings._replace(metrics=settings.metrics or available())._asdict(),
         "regions": reference.in_regions,
     }
-
-
-def _digest(parts: Iterable[bytes]) -> str:
-    digest = hashlib.sha256()
-    for part in parts:
-        digest.update(hashlib.sha256(part).digest())
-    return digest.hexdigest()
 
 
 def _as_json(track: MethodResult) -> dict[str, Any]:

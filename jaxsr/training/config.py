@@ -7,21 +7,16 @@ import dataclasses
 import hashlib
 import json
 import math
-import platform
-import subprocess
-import time
 from collections.abc import Sequence as List
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
-import jax
-
-import jaxsr
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path
 from jaxsr.io.sequence import Sequence
 from jaxsr.methods import Method
+from jaxsr.provenance import changes, provenance
 
 
 @dataclass(frozen=True)
@@ -103,14 +98,7 @@ def describe(
         "sequences": [identity(path) for path in trained_on],
         "evaluated": [identity(path) for path in evaluated_on],
         "init": _hash_of(config.init),
-        "made": {
-            "jaxsr": jaxsr.__version__,
-            "jax": jax.__version__,
-            "python": platform.python_version(),
-            "device": device(),
-            "commit": commit(),
-            "date": time.strftime("%Y-%m-%d %H:%M"),
-        },
+        "made": provenance(),
     }
 
 
@@ -124,25 +112,6 @@ def _hash_of(file: Path | None) -> str | None:
     if file is None:
         return None
     return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file.is_file() else MISSING
-
-
-def device() -> str:
-    """The devices that train, for instance "1 x NVIDIA H100, x86_64"."""
-    devices = jax.local_devices()
-    return f"{len(devices)} x {devices[0].device_kind}, {platform.machine()}"
-
-
-def commit() -> str | None:
-    """`git describe` of the checkout that jaxsr runs from; None where it was installed without one."""
-    root = Path(jaxsr.__file__).parents[1]
-    if not (root / ".git").exists():
-        return None
-    command = ["git", "-C", str(root), "describe", "--always", "--dirty"]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=False)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip() or None
 
 
 def enter(out: Path, new: dict[str, Any]) -> list[str]:
@@ -180,9 +149,7 @@ def enter(out: Path, new: dict[str, Any]) -> list[str]:
                 found=", ".join(found),
                 fix="choose another --out (with --init, to start from these weights), or give the old values",
             )
-        changed = [
-            f"{k} {made.get(k)} -> {v}" for k, v in new["made"].items() if k != "date" and v != made.get(k)
-        ]
+        changed = changes(made, new["made"])
         return [f"not to the bit as if it had never stopped: {', '.join(changed)}"] if changed else []
     with atomic_path(file) as temporary:
         temporary.write_text(json.dumps(new, indent=1) + "\n", encoding="utf-8")

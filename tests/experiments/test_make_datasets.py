@@ -1,8 +1,6 @@
 """Archives of sequences (round trip within the stated errors, damage, size) and the data-set script."""
 
 import json
-import re
-import subprocess
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -14,7 +12,6 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from experiments import make_datasets as md
-from experiments.provenance import commit
 from jaxsr.errors import JaxsrError
 from jaxsr.io import archive
 from jaxsr.io.archive_coding import decode_plane, encode_plane, quantise_normal, restore_normal
@@ -322,19 +319,6 @@ def test_a_failed_floor_keeps_the_log_that_it_names(tmp_path, monkeypatch, capsy
     assert "out of memory" in message[0]
     assert log.read_text() == "out of memory\n"
     assert not (tmp_path / "floors.json").exists()
-
-
-def test_commit_of_a_result(tmp_path):
-    assert commit(tmp_path) == "unknown"
-    subprocess.run(["git", "init", "-q", tmp_path], check=True)
-    (tmp_path / "a").write_text("1")
-    subprocess.run(["git", "-C", tmp_path, "add", "a"], check=True)
-    who = ["-c", "user.name=n", "-c", "user.email=e@example.org"]
-    subprocess.run(["git", "-C", tmp_path, *who, "commit", "-qm", "m"], check=True)
-    clean = commit(tmp_path)
-    assert re.fullmatch("[0-9a-f]{4,}", clean)
-    (tmp_path / "a").write_text("2")
-    assert commit(tmp_path) == f"{clean}-dirty"
 
 
 def test_budget_ends_before_the_next_clip(tmp_path, monkeypatch):
