@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all, bounded reading of small files, digests.
+"""Files and folders that appear whole or not at all, bounded reading of small files, digests.
 
 Whatever lies at a path that a user names may be a folder, a named pipe, or something far too large. The
 readers here answer each of these with one `JaxsrError`, never with a hang or with all of the memory.
@@ -8,10 +8,14 @@ import contextlib
 import hashlib
 import json
 import os
+import platform
 import re
+import shutil
 import stat
 import threading
+import time
 from collections.abc import Iterable, Iterator
+from functools import cache
 from io import BufferedReader
 from pathlib import Path
 from typing import Any
@@ -23,7 +27,9 @@ JSON_BYTES = 32 << 20
 JSON_DEPTH = 64
 """Deepest nesting of JSON that is read; the deepest that jaxsr writes is about 8."""
 _INTEGER_DIGITS = 40  # 128 bits, as the states of random generators have
-_TEMPORARY = re.compile(r"\..+\.\d+-\d+\.tmp")
+ABANDONED_SECONDS = 24 * 3600.0
+"""A temporary file that nobody has touched for so long has no writer any more."""
+_TEMPORARY = re.compile(r"\..+\.((?P<host>[0-9a-f]{8})-)?(?P<process>\d+)-\d+\.tmp")
 _KINDS = (
     (stat.S_ISFIFO, "a named pipe"),
     (stat.S_ISSOCK, "a socket"),
@@ -189,9 +195,13 @@ def digest(parts: Iterable[bytes]) -> str:
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """A temporary name in the folder of `path` that replaces `path` when the block ends without an error."""
+    """A temporary name in the folder of `path` that replaces `path` when the block ends without an error.
+
+    Raises:
+        JaxsrError: an OSError of the block, such as a full disk.
+    """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{threading.get_ident()}.tmp")
+    temporary = _temporary_name(path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         yield temporary
@@ -201,6 +211,34 @@ def atomic_path(path: Path) -> Iterator[Path]:
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
+
+
+@contextlib.contextmanager
+def atomic_folder(path: Path, fix: str = "check the folder") -> Iterator[Path]:
+    """A new temporary folder that becomes `path` when the block ends without an error.
+
+    If `path` is a folder with content by then, because another process made the same one, it stays as it is
+    and the temporary folder is deleted.
+
+    Raises:
+        JaxsrError: an OSError of the block, such as a full disk; it tells the user to `fix`.
+    """
+    path = Path(path)
+    temporary = _temporary_name(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        shutil.rmtree(temporary, ignore_errors=True)
+        temporary.mkdir()
+        yield temporary
+        try:
+            temporary.rename(path)
+        except OSError:
+            if not path.is_dir():
+                raise
+    except OSError as e:
+        raise JaxsrError("cannot write", where=path, found=e.strerror or e, fix=fix) from e
+    finally:
+        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def write_text(path: Path, text: str) -> None:
@@ -213,9 +251,58 @@ def write_text(path: Path, text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+# --- what killed writers leave behind --------------------------------------------------------------------
+
+
 def remove_leftovers(folder: Path) -> int:
-    """Delete what killed writers left in `folder` (names that `atomic_path` gives); returns how many."""
-    leftovers = [p for p in Path(folder).glob(".*.tmp") if _TEMPORARY.fullmatch(p.name)]
-    for path in leftovers:
-        path.unlink(missing_ok=True)
-    return len(leftovers)
+    """Delete the temporary files and folders in `folder` whose writers are dead; returns how many.
+
+    Only names that `atomic_path` and `atomic_folder` give count. A writer is dead if its process ran on this
+    machine and is gone, or, where that cannot be told, if nothing was written for `ABANDONED_SECONDS`.
+    """
+    count = 0
+    for path in Path(folder).glob(".*.tmp"):
+        named = _TEMPORARY.fullmatch(path.name)
+        if named is None or not _is_abandoned(path, named["host"], int(named["process"])):
+            continue
+        with contextlib.suppress(OSError):  # another process deletes it at the same time
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+            count += 1
+    return count
+
+
+def _temporary_name(path: Path) -> Path:
+    return path.with_name(f".{path.name}.{_host()}-{os.getpid()}-{threading.get_ident()}.tmp")
+
+
+@cache
+def _host() -> str:
+    """A short name of this machine or, inside a container, of its own table of processes."""
+    try:
+        processes = str(Path("/proc/self/ns/pid").readlink())
+    except OSError:  # not Linux
+        processes = ""
+    return hashlib.sha256(f"{platform.node()} {processes}".encode()).hexdigest()[:8]
+
+
+def _is_abandoned(path: Path, host: str | None, process: int) -> bool:
+    if host in (None, _host()) and not _is_alive(process):  # versions up to 0.1 named no host
+        return True
+    try:
+        inside = path.rglob("*") if path.is_dir() else ()
+        touched = max(p.lstat().st_mtime for p in (path, *inside))
+    except OSError:  # it was renamed in this moment: its writer is alive
+        return False
+    return time.time() - touched > ABANDONED_SECONDS
+
+
+def _is_alive(process: int) -> bool:
+    if os.name == "nt":
+        return True  # there, signal 0 would end the process
+    try:
+        os.kill(process, 0)
+    except (ProcessLookupError, OverflowError):
+        return False
+    except OSError:  # it belongs to someone else
+        pass
+    return True

@@ -1,12 +1,29 @@
 """jaxsr.files: bounded readers, JSON of strangers, digests, writing that is whole or not at all."""
 
 import os
+import signal
+import subprocess
+import sys
 import time
+from pathlib import Path
 
 import pytest
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import JSON_DEPTH, digest, file_digest, open_file, parse_json, read_bytes, read_json
+from jaxsr.files import (
+    ABANDONED_SECONDS,
+    JSON_DEPTH,
+    atomic_folder,
+    atomic_path,
+    digest,
+    file_digest,
+    open_file,
+    parse_json,
+    read_bytes,
+    read_json,
+    remove_leftovers,
+    write_text,
+)
 
 
 @pytest.mark.parametrize(
@@ -84,3 +101,72 @@ def test_digests(tmp_path):
     assert file_digest(tmp_path / "a").startswith("ba7816bf8f01cfea414140de5dae2223")  # FIPS 180-2, B.1
     assert digest([b"ab", b"c"]) != digest([b"a", b"bc"])
     assert digest([b"ab", b"c"]) == digest(iter([b"ab", b"c"]))
+
+
+def test_a_folder_appears_whole_or_not_at_all(tmp_path):
+    target = tmp_path / "new" / "target"
+
+    def fail():
+        with atomic_folder(target) as temporary:
+            (temporary / "a").write_text("half")
+            raise KeyError
+
+    with pytest.raises(KeyError):
+        fail()
+    assert list(target.parent.iterdir()) == []
+    with atomic_folder(target) as temporary:
+        assert temporary.parent == target.parent
+        (temporary / "a").write_text("whole")
+        assert not target.exists()
+    with atomic_folder(target) as temporary:  # someone else was first
+        (temporary / "a").write_text("again")
+    assert (target / "a").read_text() == "whole"
+    assert list(target.parent.iterdir()) == [target]
+    expected = pytest.raises(JaxsrError, match=r"a.b: cannot write; found File exists; make room")
+    with expected, atomic_folder(target / "a" / "b", fix="make room"):
+        pass
+
+
+def test_texts_are_written_whole(tmp_path):
+    write_text(tmp_path / "sub" / "a.txt", "é")
+    assert (tmp_path / "sub" / "a.txt").read_bytes() == b"\xc3\xa9"
+    with pytest.raises(JaxsrError, match="cannot write"):
+        write_text(tmp_path / "sub" / "a.txt" / "b", "x")
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from jaxsr.files import atomic_folder, atomic_path
+
+with atomic_path(Path(sys.argv[1]) / "file") as file, atomic_folder(Path(sys.argv[1]) / "folder") as folder:
+    file.write_text("half")
+    (folder / "inside").write_text("half")
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_leftovers_go_only_where_their_writer_is_dead(tmp_path):
+    (tmp_path / "0001.exr").write_bytes(b"x")
+    (tmp_path / ".notes.tmp").write_bytes(b"the user's own")
+    (tmp_path / ".notes.2-3.txt.tmp").write_bytes(b"the user's own")
+    (tmp_path / ".0001.exr.9999999-1.tmp").write_bytes(b"of an earlier version")
+    other = tmp_path / ".far.exr.01234567-9999999-1.tmp"  # another machine's: its processes cannot be seen
+    other.write_bytes(b"half")
+    done = subprocess.run([sys.executable, "-c", KILLED, tmp_path], cwd=Path(__file__).parents[1])
+    assert done.returncode == -signal.SIGKILL
+    assert len(list(tmp_path.glob(".f*.tmp"))) == 3
+    with atomic_path(tmp_path / "mine") as mine, atomic_folder(tmp_path / "ours") as ours:
+        mine.write_bytes(b"half")
+        (ours / "inside").write_bytes(b"half")
+        assert remove_leftovers(tmp_path) == 3
+        assert sorted(tmp_path.glob(".*.tmp")) == sorted(
+            [other, mine, ours, tmp_path / ".notes.tmp", tmp_path / ".notes.2-3.txt.tmp"]
+        )
+        old = time.time() - ABANDONED_SECONDS - 10
+        for path in (other, mine, ours):
+            os.utime(path, (old, old))
+        assert remove_leftovers(tmp_path) == 2
+        assert (ours / "inside").exists(), "a file inside was just written"
+        mine.write_bytes(b"whole")
+    assert remove_leftovers(tmp_path / "no-such-folder") == 0

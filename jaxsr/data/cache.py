@@ -16,8 +16,6 @@ import hashlib
 import json
 import os
 import shutil
-import threading
-import time
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -26,6 +24,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from jaxsr.errors import JaxsrError
+from jaxsr.files import atomic_folder, read_json, remove_leftovers
 from jaxsr.io.sequence import Sequence
 from jaxsr.io.writing import LAYERS, frame_file
 
@@ -33,7 +32,6 @@ Progress = Callable[[str, int], Callable[[], Any]]
 """Called with a title and a number of steps; returns what is called after each step."""
 
 _VERSION = 1
-_ABANDONED_SECONDS = 3600.0  # a conversion writes a frame in a second or so: after an hour its writer is dead
 _WORKERS = 4
 
 
@@ -110,18 +108,10 @@ def _open(seq: Sequence, resolution: str, home: Path, progress: Progress | None)
     key = source_key(seq, resolution)
     folder = home / f"{resolution}-{key[:16]}"
     if not folder.is_dir():
-        try:
-            _convert(seq, resolution, key, folder, progress)
-        except OSError as e:
-            raise JaxsrError(
-                "the arrays of a sequence cannot be written",
-                where=folder,
-                found=e.strerror or e,
-                fix="make room, or choose another folder for the cache",
-            ) from e
+        _convert(seq, resolution, key, folder, progress)
         _remove_stale(home, resolution, folder)
     try:
-        head = json.loads((folder / "arrays.json").read_text(encoding="utf-8"))
+        head = read_json(folder / "arrays.json", dict)
         layers = {n: _map(folder / f"{n}.npy") for n in head["layers"]}
         return Arrays(seq, resolution, layers, head["absent"])
     except (OSError, ValueError, KeyError, TypeError) as e:
@@ -136,12 +126,8 @@ def _map(path: Path) -> np.ndarray:
 
 def _convert(seq: Sequence, resolution: str, key: str, folder: Path, progress: Progress | None) -> None:
     advance = progress(f"convert {seq.path.name}", len(seq)) if progress is not None else lambda: None
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}-{threading.get_ident()}.tmp")
-    shutil.rmtree(temporary, ignore_errors=True)
-    temporary.mkdir()
-    with contextlib.ExitStack() as stack:
-        stack.callback(shutil.rmtree, temporary, ignore_errors=True)
+    fix = "make room, or choose another folder for the cache"
+    with atomic_folder(folder, fix) as temporary, contextlib.ExitStack() as stack:
         files = {n: stack.enter_context(_LayerFile(temporary / f"{n}.npy", len(seq))) for n in LAYERS}
         for i, layers in enumerate(_frames(seq, resolution)):
             for name, pixels in layers.items():
@@ -162,14 +148,9 @@ def _convert(seq: Sequence, resolution: str, key: str, folder: Path, progress: P
             "source": str(seq.path.resolve()),
             "layers": whole,
             "absent": {n: seq.infos[f.count].index for n, f in files.items() if f.seen and n not in whole},
-            "sequence": json.loads((seq.path / "sequence.json").read_text(encoding="utf-8")),
+            "sequence": read_json(seq.path / "sequence.json"),
         }
         (temporary / "arrays.json").write_text(json.dumps(head, indent=1), encoding="utf-8")
-        try:
-            temporary.rename(folder)
-        except OSError:
-            if not folder.is_dir():  # else another process was first, with the same
-                raise
 
 
 def _frames(seq: Sequence, resolution: str) -> Iterator[dict[str, np.ndarray]]:
@@ -245,8 +226,4 @@ def _remove_stale(home: Path, resolution: str, keep: Path) -> None:
     for old in home.glob(f"{resolution}-*"):
         if old != keep:
             shutil.rmtree(old, ignore_errors=True)
-    for old in home.glob(f".{resolution}-*.tmp"):
-        with contextlib.suppress(OSError):
-            touched = max(p.stat().st_mtime for p in (old, *old.iterdir()))
-            if time.time() - touched > _ABANDONED_SECONDS:
-                shutil.rmtree(old, ignore_errors=True)
+    remove_leftovers(home)

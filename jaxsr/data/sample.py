@@ -11,7 +11,9 @@ from typing import Any
 
 import jaxsr
 from jaxsr.errors import JaxsrError
+from jaxsr.files import atomic_folder, remove_leftovers
 from jaxsr.io.archive import read_manifest, unpack_sequence
+from jaxsr.io.sequence import Sequence
 
 
 def sample_folder() -> Path:
@@ -40,6 +42,9 @@ def unpack_sample(
 ) -> list[Path]:
     """Unpack the sequences of a split to `out/<name>`; what is there already is kept.
 
+    A sequence appears under its name when it is whole, so that processes may unpack to the same folder at
+    the same time.
+
     Args:
         split: "test" or "train".
         scenes: names; all by default.
@@ -50,7 +55,7 @@ def unpack_sample(
         The folders, one a sequence.
 
     Raises:
-        JaxsrError: no such scene, split or scale, no sample, or a damaged archive.
+        JaxsrError: no such scene, split or scale, no sample, a damaged archive, or no room.
     """
     known = sample_scenes()
     unknown = sorted(set(scenes) - set(known))
@@ -70,6 +75,29 @@ def unpack_sample(
     advance = progress("unpack", len(found))
     folders = []
     for archive, manifest, name in found:
-        folders.append(unpack_sequence(archive, manifest, name, out / Path(name).name))
+        folders.append(out / Path(name).name)
+        _unpack(archive, manifest, name, folders[-1])
         advance()
+    remove_leftovers(out)
     return folders
+
+
+def _unpack(archive: Path, manifest: dict[str, Any], name: str, folder: Path) -> None:
+    if _is_whole(folder, manifest["sequences"][name]):
+        return
+    if folder.exists():  # a part of it, as versions up to 0.1 left it when they were killed
+        unpack_sequence(archive, manifest, name, folder)
+        return
+    with atomic_folder(folder) as temporary:
+        unpack_sequence(archive, manifest, name, temporary)
+
+
+def _is_whole(folder: Path, head: dict[str, Any]) -> bool:
+    """Whether the folder holds a sequence of these frames and sizes; its pixels are not looked at."""
+    try:
+        found = Sequence.open(folder)
+    except JaxsrError:
+        return False
+    indices = [info.index for info in found.infos]
+    expected = [frame["index"] for frame in head["frames"]]
+    return (indices, list(found.size), list(found.scales)) == (expected, head["size"], head["scales"])

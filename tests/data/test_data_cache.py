@@ -137,16 +137,10 @@ def test_a_killed_conversion_is_not_taken_for_whole(tmp_path):
         timeout=120,
     )
     assert process.returncode == -signal.SIGKILL
-    (left,) = leftovers(cache)
+    assert len(leftovers(cache)) == 1
     arrays = open_arrays(seq.path, ("hr",), cache=cache)["hr"]
     np.testing.assert_array_equal(arrays.layers["color"][2], seq.truth(2).astype(np.float16))
-    assert left.exists()  # it may belong to somebody who is at work
-    os.utime(left, (1, 1))
-    for file in left.iterdir():
-        os.utime(file, (1, 1))
-    os.utime(seq.path / "hr/0001.exr", (1, 1))
-    open_arrays(seq.path, ("hr",), cache=cache)
-    assert not leftovers(cache)
+    assert not leftovers(cache)  # its process is dead
 
 
 def test_two_at_the_same_time_do_not_disturb_each_other(tmp_path):
@@ -208,7 +202,7 @@ def test_errors_name_the_place(tmp_path):
     with pytest.raises(JaxsrError, match=r"scale 4 is not available; expected one of \[1, 2\]"):
         open_arrays(seq.path, ("x4",), cache=cache)
     (tmp_path / "file").write_text("")
-    with pytest.raises(JaxsrError, match=r"file.*cannot be written.*choose another folder"):
+    with pytest.raises(JaxsrError, match=r"file.*cannot write.*choose another folder"):
         open_arrays(seq.path, ("hr",), cache=tmp_path / "file")
     open_arrays(seq.path, ("hr",), cache=cache)
     for damaged in ("color.npy", "arrays.json"):
@@ -236,7 +230,7 @@ def test_a_disk_that_is_full_is_an_error(tmp_path):
         text=True,
         timeout=120,
     )
-    assert "cannot be written; found File too large; make room" in process.stderr
+    assert "cannot write; found File too large; make room" in process.stderr
     assert not leftovers(tmp_path)
 
 

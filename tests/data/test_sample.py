@@ -1,12 +1,18 @@
 """The rendered sample that ships: whole, readable, small enough, and what the data card says it is."""
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from jaxsr.data import sample
 from jaxsr.errors import JaxsrError
-from jaxsr.io.archive import read_manifest, verify
+from jaxsr.io.archive import pack, read_manifest, verify
 from jaxsr.io.sequence import Sequence
+from tests.builders import make_sequence
 
 SCENES = ["bunker", "docks", "forest"]
 
@@ -60,3 +66,79 @@ def test_errors(tmp_path):
     with pytest.raises(JaxsrError, match="scale 3 is not available"):
         sample.unpack_sample(tmp_path, "test", scale=3)
     assert not list(tmp_path.iterdir())
+
+
+TOGETHER = """
+import os, sys, traceback
+from pathlib import Path
+from jaxsr.data import sample
+from jaxsr.io.sequence import Sequence
+
+sample.sample_folder = lambda: Path(sys.argv[1])
+gate, opener = os.pipe()
+children = []
+for _ in range(8):
+    children.append(os.fork())
+    if children[-1] == 0:
+        os.close(opener)
+        os.read(gate, 1)  # until the parent closes it: all begin at once
+        try:
+            (folder,) = sample.unpack_sample(Path(sys.argv[2]), "train")
+            sequence = Sequence.open(folder)
+            assert len(sequence) == 4 and sequence.truth(3).shape == (12, 16, 3)
+            os._exit(0)
+        except BaseException:
+            traceback.print_exc()
+            os._exit(1)
+os.close(opener)
+print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children])
+"""
+
+
+@pytest.fixture
+def tiny(tmp_path, monkeypatch):
+    """The folder of a sample of one tiny scene, which is used in place of the real one."""
+    sequence = make_sequence(tmp_path / "tiny-train-0", size=(16, 12), frames=4, scales=(2,))
+    pack({"train/tiny-train-0": sequence.path}, tmp_path / "archives" / "tiny.jsrz")
+    monkeypatch.setattr(sample, "sample_folder", lambda: tmp_path / "archives")
+    return tmp_path / "archives"
+
+
+def test_eight_processes_unpack_at_once(tiny, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", TOGETHER, tiny, tmp_path / "out"],
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.stdout.strip() == str([0] * 8), done.stderr
+    assert [p.name for p in (tmp_path / "out").iterdir()] == ["tiny-train-0"]
+
+
+def test_leftovers_of_dead_processes_go_and_those_of_living_ones_stay(tiny, tmp_path):
+    dead, alive = (tmp_path / "out" / f".tiny-train-0.{pid}-1.tmp" for pid in (9999999, os.getpid()))
+    for folder in (dead, alive):
+        (folder / "hr").mkdir(parents=True)
+    (folder,) = sample.unpack_sample(tmp_path / "out", "train")
+    assert sorted((tmp_path / "out").iterdir()) == [alive, folder]
+
+
+def test_a_part_that_an_earlier_version_left_is_completed(tiny, tmp_path):
+    (folder,) = sample.unpack_sample(tmp_path / "out", "train")
+    whole = {p.name: p.read_bytes() for p in (folder / "hr").iterdir()}
+    (folder / "hr" / "0003.exr").unlink()
+    assert sample.unpack_sample(tmp_path / "out", "train") == [folder]
+    assert {p.name: p.read_bytes() for p in (folder / "hr").iterdir()} == whole
+
+
+def test_a_full_disk_leaves_nothing_behind(tiny, tmp_path, monkeypatch):
+    def full(archive, manifest, name, folder):
+        (folder / "hr").mkdir(parents=True)
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(sample, "unpack_sequence", full)
+    with pytest.raises(JaxsrError, match="tiny-train-0: cannot write; found No space left on device"):
+        sample.unpack_sample(tmp_path / "out", "train")
+    assert not list((tmp_path / "out").iterdir())

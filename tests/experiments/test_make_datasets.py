@@ -231,7 +231,7 @@ def test_damaged_manifests_and_checksums(tmp_path):
 def test_packing_removes_what_a_killed_one_left(tmp_path):
     source = write_sequence(tmp_path / "source", frames=1)
     (tmp_path / "shelf").mkdir()
-    (tmp_path / "shelf" / ".docks.jsrz.77-1.tmp").write_bytes(b"half")
+    (tmp_path / "shelf" / ".docks.jsrz.9999999-1.tmp").write_bytes(b"half")
     (tmp_path / "shelf" / ".mine.tmp").write_bytes(b"not ours")
     archive.pack({"s": source}, tmp_path / "shelf" / "a.jsrz")
     found = sorted(p.name for p in (tmp_path / "shelf").iterdir())

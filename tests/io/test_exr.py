@@ -9,7 +9,6 @@ import OpenEXR
 import pytest
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path, remove_leftovers
 from jaxsr.io.exr import read_exr, read_exr_header, write_exr
 
 
@@ -218,18 +217,6 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(JaxsrError, match="cannot write"):
         write_exr(tmp_path / "file" / "a.exr", example())
-
-
-def test_leftovers_of_killed_writers_go(tmp_path):
-    (tmp_path / ".0001.exr.77-1.tmp").write_bytes(b"half")
-    (tmp_path / "0001.exr").write_bytes(b"x")
-    (tmp_path / ".notes.tmp").write_bytes(b"the user's own")
-    assert remove_leftovers(tmp_path) == 1
-    assert sorted(p.name for p in tmp_path.iterdir()) == [".notes.tmp", "0001.exr"]
-    with atomic_path(tmp_path / "a.exr") as temporary:
-        temporary.write_bytes(b"whole")
-    temporary.write_bytes(b"as if killed")
-    assert remove_leftovers(tmp_path) == 1
 
 
 def test_reading_from_threads(tmp_path):

@@ -270,7 +270,7 @@ def test_a_killed_writer_resumes(tmp_path):
     first.write_frame(frame_info(1, SIZE, reset=True), layers(1), {2: layers(1, 2)})
     # Killed inside frame 2: HR is there, LR half-written under its temporary name.
     write_exr(tmp_path / "hr/0002.exr", {"depth.Z": np.zeros((24, 32), np.float32)})
-    (tmp_path / "x2/.0002.exr.99-1.tmp").write_bytes(b"half")
+    (tmp_path / "x2/.0002.exr.9999999-1.tmp").write_bytes(b"half")
     again = writer(tmp_path)
     assert not list(tmp_path.rglob("*.tmp"))
     assert again.has(1)
