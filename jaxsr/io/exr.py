@@ -7,9 +7,6 @@ read. Writing is single-part, scan lines, lossless, and atomic.
 """
 
 import contextlib
-import mmap
-import os
-import struct
 import sys
 import threading
 from collections.abc import Iterator, Mapping
@@ -21,6 +18,7 @@ import OpenEXR
 
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path
+from jaxsr.io.exr_header import check_file
 
 _COMPRESSIONS = {
     "none": OpenEXR.NO_COMPRESSION,
@@ -33,26 +31,30 @@ _STRUCTURE = {
     "channels", "compression", "dataWindow", "displayWindow", "lineOrder", "pixelAspectRatio", "type",
     "screenWindowCenter", "screenWindowWidth", "tiles", "chunkCount", "version", "name", "view",
 }  # fmt: skip
-_LINES_PER_CHUNK = {0: 1, 1: 1, 2: 1, 3: 16, 4: 32, 5: 16, 6: 32, 7: 32, 8: 32, 9: 256}
-_MAGIC = 20000630
 
 
-def read_exr(path: str | Path, *, pad: bool = True) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+def read_exr(
+    path: str | Path, *, pad: bool = True, size: tuple[int, int] | None = None, because: str = ""
+) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Read every channel of every part.
 
     Args:
         path: the file.
         pad: fill what the data window leaves out of the display window with zeros; False makes it an error.
+        size: the height and width that the image must have. They are compared with the header, before any
+            pixel is decoded: a small file can hold a huge image.
+        because: for the error: what says that size, such as "HR 32x24, scale 2".
 
     Returns:
         Channel name -> `[H, W]` array as stored, and the header's attributes that are not about layout
         (those of the first part win).
 
     Raises:
-        JaxsrError: missing, not an OpenEXR file, truncated, damaged, deep, or not covering its window.
+        JaxsrError: missing, not an OpenEXR file, truncated, damaged, deep, of another size, above the limits
+            of `jaxsr.io.exr_header`, or not covering its window.
     """
     path = Path(path)
-    _check_complete(path)
+    check_file(path, size, because)
     file = _open(path, header_only=False)
     channels: dict[str, np.ndarray] = {}
     metadata: dict[str, Any] = {}
@@ -68,7 +70,7 @@ def read_exr(path: str | Path, *, pad: bool = True) -> tuple[dict[str, np.ndarra
                 raise JaxsrError(
                     f"channel {name!r} is subsampled",
                     where=path,
-                    expected="one value a pixel",
+                    expected="one value per pixel",
                     found=f"sampling {channel.xSampling}x{channel.ySampling}",
                     fix="write it again without chroma subsampling",
                 )
@@ -82,7 +84,7 @@ def read_exr(path: str | Path, *, pad: bool = True) -> tuple[dict[str, np.ndarra
 def read_exr_header(path: str | Path) -> tuple[list[str], dict[str, Any]]:
     """Channel names of all parts (as `read_exr` names them) and attributes, without decoding pixels."""
     path = Path(path)
-    _check_complete(path)
+    check_file(path)
     parts = _open(path, header_only=True).parts
     names = [[c.name for c in part.header["channels"]] for part in parts]
     flat = [name for part in names for name in part]
@@ -107,7 +109,7 @@ def write_exr(
         path: the file; its folder is made.
         channels: name -> `[H, W]` array, all of one size, of float16, float32 or uint32.
         metadata: attributes for the header: strings, numbers, or what `read_exr` returned.
-        compression: "zip" (16 lines a block), "zips" (1 line), "piz" or "none". All lossless: the lossy
+        compression: "zip" (blocks of 16 lines), "zips" (of 1 line), "piz" or "none". All lossless: the lossy
             ones spoil G-buffers.
 
     Raises:
@@ -151,7 +153,8 @@ class _Muted:
     lock = threading.Lock()
     readers: set[int] = set()  # noqa: RUF012
     last: "_Muted | None" = None
-    """Kept and used again: `print` holds no reference to sys.stdout, so one that is freed here crashes it."""
+    """The latest one, which is used again. `print` in another thread holds no reference to sys.stdout: if
+    this object were freed, that thread would crash."""
 
     def __init__(self, stream: Any):
         self.stream = stream
@@ -217,92 +220,3 @@ def _to_display_window(pixels: np.ndarray, header: Mapping[str, Any], where: str
             top - y0 : bottom - y0 + 1, left - x0 : right - x0 + 1
         ]
     return out
-
-
-def _check_complete(path: Path) -> None:
-    """Walk the header and the table of chunk offsets: the library reports a cut file only as damaged."""
-    try:
-        with path.open("rb") as file:
-            size = os.fstat(file.fileno()).st_size
-            if size == 0:
-                raise JaxsrError("the file is empty", where=path, fix="write it again")
-            with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as data:
-                if size < 8 or struct.unpack_from("<i", data)[0] != _MAGIC:
-                    raise JaxsrError(
-                        "not an OpenEXR file",
-                        where=path,
-                        expected="the bytes 76 2f 31 01 at the start",
-                        found=data[:4].hex(" "),
-                    )
-                needed = _needed_bytes(data, path)
-    except FileNotFoundError as e:
-        raise JaxsrError("no such file", where=path) from e
-    except IsADirectoryError as e:
-        raise JaxsrError("is a folder", where=path, expected="an OpenEXR file") from e
-    except OSError as e:
-        raise JaxsrError("cannot be read", where=path, found=e.strerror or e) from e
-    except struct.error as e:
-        raise _truncated(path, size, "a whole header") from e
-    if needed is None or needed > size:
-        raise _truncated(path, size, "a finished file" if needed is None else f"{needed} bytes at least")
-
-
-def _truncated(path: Path, size: int, expected: str) -> JaxsrError:
-    return JaxsrError(
-        "the file is truncated",
-        where=path,
-        expected=expected,
-        found=f"{size} bytes",
-        fix="the writer was stopped or the disk was full: write it again",
-    )
-
-
-def _needed_bytes(data: mmap.mmap, path: Path) -> int | None:
-    """Where the last chunk ends; None when the chunk table was never filled in."""
-    flags = struct.unpack_from("<i", data, 4)[0]
-    tiled, deep, multipart = flags & 0x200, flags & 0x800, flags & 0x1000
-    if deep:
-        raise JaxsrError("holds deep pixels", where=path, expected="a flat image", fix="flatten it first")
-    at, chunks, known = 8, 0, True
-    while True:  # one header a part; a multi-part file ends them with an empty one
-        attributes, at = _attributes(data, at)
-        if multipart and not attributes:
-            break
-        if "chunkCount" in attributes:
-            chunks += struct.unpack("<i", attributes["chunkCount"])[0]
-        elif not tiled and "dataWindow" in attributes and "compression" in attributes:
-            _, y0, _, y1 = struct.unpack("<4i", attributes["dataWindow"])
-            lines = _LINES_PER_CHUNK.get(attributes["compression"][0])
-            known, chunks = known and lines is not None, chunks + -(-(y1 - y0 + 1) // (lines or 1))
-        else:
-            known = False
-        if not multipart:
-            break
-    if not known or not 0 < chunks < 1 << 28:
-        return 0  # tiles without a chunk count: left to the library
-    offsets = struct.unpack_from(f"<{chunks}Q", data, at)
-    if min(offsets) == 0:
-        return None
-    # A chunk is [part number], coordinates, the length of its pixels, and the pixels.
-    pixels = max(offsets) + (4 if multipart else 0) + (16 if tiled else 4) + 4
-    if pixels > len(data):
-        return pixels
-    return pixels + struct.unpack_from("<i", data, pixels - 4)[0]
-
-
-def _attributes(data: mmap.mmap, at: int) -> tuple[dict[str, bytes], int]:
-    found: dict[str, bytes] = {}
-    while True:
-        end = data.find(b"\0", at)
-        if end < 0:
-            raise struct.error("no end of the attribute's name")
-        if end == at:
-            return found, at + 1
-        name, kind_end = data[at:end].decode("latin-1"), data.find(b"\0", end + 1)
-        if kind_end < 0:
-            raise struct.error("no end of the attribute's type")
-        (length,) = struct.unpack_from("<i", data, kind_end + 1)
-        at = kind_end + 5 + length
-        if length < 0 or at > len(data):
-            raise struct.error("the attribute is longer than the file")
-        found[name] = data[kind_end + 5 : at]

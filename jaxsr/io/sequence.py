@@ -178,7 +178,14 @@ class Sequence:
     ) -> dict[str, np.ndarray]:
         index = self._info(i).index
         path = frame_file(self.path, resolution, index)
-        channels, _ = read_exr(path, pad=False)
+        scale = 1 if resolution == "hr" else int(resolution[1:])
+        width, height = self.size
+        channels, _ = read_exr(
+            path,
+            pad=False,
+            size=(height // scale, width // scale),
+            because=f"sequence.json: HR {width}x{height}, scale {scale}",
+        )
         layers = {}
         for layer, letters in LAYERS.items():
             names = [f"{layer}.{c}" for c in letters]
@@ -199,17 +206,7 @@ class Sequence:
                 raise self._missing(
                     i, resolution, layer, dict.fromkeys(n.rpartition(".")[0] or n for n in channels)
                 )
-        scale = 1 if resolution == "hr" else int(resolution[1:])
-        expected = (self.size[1] // scale, self.size[0] // scale)
         for layer, x in layers.items():
-            if x.shape[:2] != expected:
-                raise JaxsrError(
-                    f"frame {index}: layer {layer!r} has the wrong size",
-                    where=path,
-                    expected=f"{expected[1]}x{expected[0]} (HR {self.size[0]}x{self.size[1]}, scale {scale})",
-                    found=f"{x.shape[1]}x{x.shape[0]}",
-                    fix="render it again, or correct size and scales in sequence.json",
-                )
             if self.check:
                 _check_finite(layer, x, index, path)
         return layers

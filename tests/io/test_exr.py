@@ -1,14 +1,19 @@
 """jaxsr.io.exr: what is written comes back, and every way a file can be wrong is one clear line."""
 
 import contextlib
+import os
+import struct
 import sys
 import threading
+import time
+import tracemalloc
 
 import numpy as np
 import OpenEXR
 import pytest
 
 from jaxsr.errors import JaxsrError
+from jaxsr.io import exr_header
 from jaxsr.io.exr import read_exr, read_exr_header, write_exr
 
 
@@ -217,6 +222,110 @@ def test_a_failed_write_leaves_the_old_file_and_no_other(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(JaxsrError, match="cannot write"):
         write_exr(tmp_path / "file" / "a.exr", example())
+
+
+def patched(path, attribute: bytes, value: bytes, count: int = 1):
+    """Replace the value of an attribute in the header."""
+    data = bytearray(path.read_bytes())
+    at = data.index(attribute + b"\0") + len(attribute) + 1
+    at = data.index(b"\0", at) + 5
+    data[at : at + len(value)] = value
+    path.write_bytes(data)
+    return path
+
+
+def peak_and_seconds(call, message):
+    """The error's text; the call must take little time and memory."""
+    tracemalloc.start()
+    start = time.monotonic()
+    with pytest.raises(JaxsrError, match=message) as caught:
+        call()
+    assert time.monotonic() - start < 2
+    assert tracemalloc.get_traced_memory()[1] < 50e6
+    tracemalloc.stop()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("window", "message"),
+    [
+        ((0, 0, 2**31 - 1, 2**31 - 1), r"a\.exr: the .* is too large; .* found 2147483648x2147483648"),
+        ((-(2**31), -(2**31), 2**31 - 1, 2**31 - 1), "too large; .* found 4294967296x4294967296"),
+        ((0, 0, 2**31 - 1, 0), "too large"),
+        ((5, 5, 0, 0), "is empty; .*found -4x-4"),
+    ],
+)
+@pytest.mark.parametrize("name", [b"dataWindow", b"displayWindow"])
+def test_headers_of_impossible_sizes(tmp_path, window, message, name):
+    write_exr(tmp_path / "a.exr", example(4, 6), compression="zips")
+    patched(tmp_path / "a.exr", name, struct.pack("<4i", *window))
+    peak_and_seconds(lambda: read_exr(tmp_path / "a.exr"), message)
+
+
+def test_a_huge_image_is_refused_by_its_header(tmp_path):
+    """Zeros compress a thousandfold: a file of one megabyte decodes to gigabytes."""
+    write_exr(tmp_path / "a.exr", {c: np.zeros((1200, 1200), np.float16) for c in "RGB"})
+    peak_and_seconds(
+        lambda: read_exr(tmp_path / "a.exr", size=(24, 32), because="scale 2"),
+        r"wrong size; expected 32x24 \(scale 2\); found 1200x1200",
+    )
+    assert read_exr(tmp_path / "a.exr", size=(1200, 1200))[0]["R"].shape == (1200, 1200)
+    windowed(tmp_path / "o.exr", (-99, -99, 100, 100), (0, 0, 7, 5))  # overscan of many times the image
+    with pytest.raises(JaxsrError, match="data window is too large; expected 1 to 432 pixels; found 200x200"):
+        read_exr(tmp_path / "o.exr", size=(6, 8))
+    assert read_exr(tmp_path / "o.exr")[0]["Z"].shape == (6, 8)
+
+
+def test_the_limits_without_an_expected_size(tmp_path, monkeypatch):
+    write_exr(tmp_path / "a.exr", {c: np.zeros((60, 50), np.float16) for c in "RGB"})
+    monkeypatch.setattr(exr_header, "MAX_PIXELS", 2999)
+    with pytest.raises(JaxsrError, match="too large; expected 1 to 2999 pixels; found 50x60"):
+        read_exr(tmp_path / "a.exr")
+    monkeypatch.setattr(exr_header, "MAX_PIXELS", 3000)
+    monkeypatch.setattr(exr_header, "MAX_BYTES", 3000 * 6 - 1)
+    with pytest.raises(JaxsrError, match=r"decoded image is too large; expected at most 17999.*found 18000"):
+        read_exr(tmp_path / "a.exr")
+    monkeypatch.setattr(exr_header, "MAX_BYTES", 3000 * 6)
+    assert set(read_exr(tmp_path / "a.exr")[0]) == set("RGB")
+
+
+def test_headers_of_rubbish(tmp_path):
+    magic, rng = bytes.fromhex("762f310102000000"), np.random.default_rng(0)
+    for k, tail in enumerate(
+        [
+            b"",
+            b"\0",
+            b"a\0b\0" + struct.pack("<i", -5),
+            b"a\0b\0" + struct.pack("<i", 2**31 - 1),
+            b"a\0b",
+            b"dataWindow\0box2i\0" + struct.pack("<i", 3) + b"abc\0" + b"x" * 100,
+            b"compression\0compression\0" + struct.pack("<i", 0) + b"\0" + b"x" * 100,
+            b"".join(b"%d\0int\0" % i + struct.pack("<ii", 4, 0) for i in range(20_000)),
+            *(rng.bytes(400) for _ in range(20)),
+        ]
+    ):
+        (tmp_path / f"{k}.exr").write_bytes(magic + tail)
+        for read in (read_exr, read_exr_header):
+            peak_and_seconds(lambda read=read, k=k: read(tmp_path / f"{k}.exr"), rf"{k}\.exr: ")
+
+
+def test_a_header_of_one_byte_changed_is_read_or_refused(tmp_path):
+    write_exr(tmp_path / "a.exr", example(6, 8))
+    whole = (tmp_path / "a.exr").read_bytes()
+    rng = np.random.default_rng(1)
+    for at in rng.choice(len(whole) - 8, 200, replace=False) + 8:
+        data = bytearray(whole)
+        data[at] = rng.integers(256)
+        (tmp_path / "b.exr").write_bytes(data)
+        with contextlib.suppress(JaxsrError):
+            read_exr(tmp_path / "b.exr", size=(6, 8))
+
+
+def test_a_pipe_is_refused_and_never_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "0001.exr")
+    for read in (read_exr, read_exr_header):
+        with pytest.raises(JaxsrError, match=r"0001\.exr: is not a regular file; .*found a named pipe"):
+            read(tmp_path / "0001.exr")
 
 
 def test_reading_from_threads(tmp_path):
