@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.nets.blocks import LoopConv, SqueezeExcite, check_counts, stacked, through
-from jaxsr.ops import depth_to_space
+from jaxsr.ops import pixel_shuffle
 
 MEAN = (0.4488, 0.4371, 0.4040)
 UPS = {2: (2,), 3: (3,), 4: (2, 2), 8: (2, 2, 2)}
@@ -107,5 +107,5 @@ class RCAN(nnx.Module):
         x = first + self.last(through(first, self.groups))
         for up in self.ups:
             x = up(x)
-            x = depth_to_space(x, math.isqrt(x.shape[-1] // first.shape[-1]))
+            x = pixel_shuffle(x, math.isqrt(x.shape[-1] // first.shape[-1]))
         return self.tail(x).astype(jnp.float32) + mean

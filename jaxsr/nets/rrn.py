@@ -6,7 +6,7 @@
 
     x   = blocks(relu(first([I_{t-1}, I_t, h_{t-1}, o_{t-1}])))
     h_t = relu(hidden(x))
-    o_t = depth_to_space(output(x)) + bilinear(I_t)
+    o_t = pixel_shuffle(output(x)) + bilinear(I_t)
 
 Contract: colour `[B, h, w, 3]` of any range, hidden state `[B, h, w, n]`, output `[B, s h, s w, 3]`, float32,
 for any h and w; nothing is clipped. Nothing is warped either: what moves must be found by convolutions. The
@@ -20,7 +20,7 @@ from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.nets.blocks import LoopConv, check_counts
-from jaxsr.ops import depth_to_space, space_to_depth, upsample
+from jaxsr.ops import pixel_shuffle, pixel_unshuffle, upsample
 
 INIT = nnx.initializers.variance_scaling(0.02, "fan_in", "normal")
 """As published, a tenth of He's: the network begins as bilinear upsampling, and the recurrence is tame."""
@@ -81,9 +81,9 @@ class RRN(nnx.Module):
         output: Float[Array, "b H W 3"],
     ) -> tuple[Float[Array, "b H W 3"], Float[Array, "b h w n"]]:
         """The output o_t and the hidden state h_t, from I_{t-1}, I_t, h_{t-1} and o_{t-1}."""
-        x = jnp.concatenate([previous, color, hidden, space_to_depth(output, self.scale)], axis=-1)
+        x = jnp.concatenate([previous, color, hidden, pixel_unshuffle(output, self.scale)], axis=-1)
         x = nnx.relu(self.first(x))
         for block in self.blocks:
             x = block(x)
-        made = depth_to_space(self.output(x).astype(jnp.float32), self.scale)
+        made = pixel_shuffle(self.output(x).astype(jnp.float32), self.scale)
         return made + upsample(color, self.scale), nnx.relu(self.hidden(x)).astype(jnp.float32)

@@ -40,11 +40,11 @@ from jaxsr.ops.masks import (
 )
 from jaxsr.ops.reprojection import reproject
 from jaxsr.ops.resampling import (
-    depth_to_space,
     pixel_grid,
+    pixel_shuffle,
+    pixel_unshuffle,
     resize,
     sample,
-    space_to_depth,
     upsample,
     zero_upsample,
 )
@@ -66,7 +66,6 @@ __all__ = [
     "demodulate",
     "demodulation_divisor",
     "depth_mask",
-    "depth_to_space",
     "disocclusion_mask",
     "forward_splat",
     "from_display",
@@ -80,6 +79,8 @@ __all__ = [
     "normal_mask",
     "occlusion_motion",
     "pixel_grid",
+    "pixel_shuffle",
+    "pixel_unshuffle",
     "position_mask",
     "positions_from_jittered_motion",
     "positions_from_motion",
@@ -89,7 +90,6 @@ __all__ = [
     "rgb_from_ycocg",
     "sample",
     "sample_jittered",
-    "space_to_depth",
     "srgb_from_linear",
     "stencil_mask",
     "to_display",

@@ -270,11 +270,11 @@ def zero_upsample(
 
 
 @functools.partial(jax.jit, static_argnames=("block",))
-def space_to_depth(image: Float[Array, "*b h w c"], block: int) -> Float[Array, "*b h2 w2 c2"]:
+def pixel_unshuffle(image: Float[Array, "*b h w c"], block: int) -> Float[Array, "*b h2 w2 c2"]:
     """Each block of pixels becomes one pixel: `[H, W, C] -> [H / b, W / b, C b^2]`, b = `block`.
 
     Output channel `c b^2 + dy b + dx` is input channel c at (dy, dx) of the block, the order of PyTorch's
-    `pixel_unshuffle`. `depth_to_space` is the inverse.
+    `pixel_unshuffle`. `pixel_shuffle` is the inverse.
 
     Raises:
         JaxsrError: the size is no multiple of `block`.
@@ -284,7 +284,7 @@ def space_to_depth(image: Float[Array, "*b h w c"], block: int) -> Float[Array, 
     if height % block or width % block:
         raise JaxsrError(
             "the image is no whole number of blocks",
-            where="space_to_depth",
+            where="pixel_unshuffle",
             expected=f"multiples of {block}",
             found=f"{height} x {width}",
         )
@@ -294,8 +294,8 @@ def space_to_depth(image: Float[Array, "*b h w c"], block: int) -> Float[Array, 
 
 
 @functools.partial(jax.jit, static_argnames=("block",))
-def depth_to_space(image: Float[Array, "*b h w c"], block: int) -> Float[Array, "*b h2 w2 c2"]:
-    """The inverse of `space_to_depth`, `[H, W, C b^2] -> [H b, W b, C]`: PyTorch's `pixel_shuffle`.
+def pixel_shuffle(image: Float[Array, "*b h w c"], block: int) -> Float[Array, "*b h2 w2 c2"]:
+    """The inverse of `pixel_unshuffle`, `[H, W, C b^2] -> [H b, W b, C]`: PyTorch's `pixel_shuffle`.
 
     Raises:
         JaxsrError: the channels are no multiple of `block` squared.
@@ -305,7 +305,7 @@ def depth_to_space(image: Float[Array, "*b h w c"], block: int) -> Float[Array, 
     if channels % (block * block):
         raise JaxsrError(
             "the channels do not fill blocks",
-            where="depth_to_space",
+            where="pixel_shuffle",
             expected=f"a multiple of {block * block}",
             found=channels,
         )

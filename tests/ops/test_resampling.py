@@ -189,9 +189,9 @@ def test_rearrangements_are_the_loops(size, scale, seed):
     image = _random(seed, *size, 2)
     np.testing.assert_array_equal(ops.zero_upsample(image, scale), reference.zero_upsample(image, scale))
     large = _random(seed, size[0] * scale, size[1] * scale, 2)
-    packed = ops.space_to_depth(large, scale)
-    np.testing.assert_array_equal(packed, reference.space_to_depth(large, scale))
-    np.testing.assert_array_equal(ops.depth_to_space(packed, scale), large)
+    packed = ops.pixel_unshuffle(large, scale)
+    np.testing.assert_array_equal(packed, reference.pixel_unshuffle(large, scale))
+    np.testing.assert_array_equal(ops.pixel_shuffle(packed, scale), large)
 
 
 @given(size=st.sampled_from(SIZES), scale=st.sampled_from([1, 2, 3]), seed=st.integers(0, 10**6))
@@ -217,15 +217,15 @@ def test_zero_upsample_gradient_is_the_adjoint():
     np.testing.assert_array_equal(gradient, weights[1::3, 2::3])
 
 
-def test_space_to_depth_is_pytorch():
-    np.testing.assert_array_equal(ops.space_to_depth(golden_ops.image(4, 6, 3), 2), GOLDEN["unshuffle"])
+def test_pixel_unshuffle_is_pytorch():
+    np.testing.assert_array_equal(ops.pixel_unshuffle(golden_ops.image(4, 6, 3), 2), GOLDEN["unshuffle"])
 
 
 def test_jit_and_batch():
     image, small = _random(7, 2, 4, 6, 4), _random(8, 2, 3, 3, 2)
     assert_jit_and_batch(lambda x: ops.zero_upsample(x, 2), image)
     assert_jit_and_batch(lambda x, o: ops.zero_upsample(x, 3, o), image, np.array([[0, 2], [1, 1]], np.int32))
-    assert_jit_and_batch(lambda x: ops.depth_to_space(ops.space_to_depth(x, 2), 2), image)
+    assert_jit_and_batch(lambda x: ops.pixel_shuffle(ops.pixel_unshuffle(x, 2), 2), image)
     assert_jit_and_batch(lambda x: ops.resize(x, (5, 5)), image)
     assert_jit_and_batch(lambda x: ops.upsample(x, 2), image)
     assert_jit_and_batch(ops.sample, image, small)
@@ -248,8 +248,8 @@ def test_upsample_traces_with_symbolic_sizes():
         lambda x: ops.resize(x, (0, 2)),
         lambda x: ops.upsample(x, 0),
         lambda x: ops.zero_upsample(x, 0),
-        lambda x: ops.space_to_depth(x, 2),
-        lambda x: ops.depth_to_space(x, 2),
+        lambda x: ops.pixel_unshuffle(x, 2),
+        lambda x: ops.pixel_shuffle(x, 2),
     ],
 )
 def test_bad_arguments_are_named(call):

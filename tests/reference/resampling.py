@@ -53,7 +53,7 @@ def zero_upsample(image: np.ndarray, scale: int, offset=(0, 0)) -> np.ndarray:
     return out
 
 
-def space_to_depth(image: np.ndarray, block: int) -> np.ndarray:
+def pixel_unshuffle(image: np.ndarray, block: int) -> np.ndarray:
     height, width, channels = image.shape
     out = np.zeros((height // block, width // block, channels * block * block))
     for y in range(height):
