@@ -1,14 +1,19 @@
 """Sequences in one small file, and back, with checksums.
 
-The archive is a ZIP file (stored, readable by any tool) of `manifest.json` and one member a frame and
+The archive is a ZIP file (stored, readable by any tool) of `manifest.json` and one member per frame and
 resolution. `manifest.json` holds each sequence's `sequence.json` word for word and the SHA-256 of every
 member; `ARCHIVE.sha256` beside the archive holds that of the whole. The layers are quantised: the table in
-`archive_coding.py` says how much. An archive takes 5 to 6 bytes a pixel (all layers) and decodes faster than
-OpenEXR. The same sequences give the same bytes.
+`archive_coding.py` says how much. An archive takes 5 to 6 bytes per pixel (all layers) and decodes faster
+than OpenEXR. The same sequences give the same bytes.
+
+An archive may come from anywhere: nothing in it is compressed by ZIP, members are bounded by the sizes in the
+manifest, planes are decompressed to exactly what these sizes need, and names cannot lead out of the folder.
 """
 
+import contextlib
 import hashlib
 import json
+import struct
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -17,23 +22,46 @@ from typing import Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path, file_digest, remove_leftovers
-from jaxsr.io.archive_coding import decode_frame, encode_frame
+from jaxsr.files import (
+    JSON_BYTES,
+    atomic_path,
+    file_digest,
+    open_file,
+    parse_json,
+    read_bytes,
+    read_json,
+    remove_leftovers,
+    write_text,
+)
+from jaxsr.io.archive_coding import CODES, decode_frame, encode_frame, largest_blob
 from jaxsr.io.exr import read_exr
+from jaxsr.io.exr_header import MAX_PIXELS
 from jaxsr.io.sequence import Sequence, check_head, frame_info
 from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter, frame_file
 
 FORMAT, VERSION = "jaxsr-archive", 1
 _EPOCH = (1980, 1, 1, 0, 0, 0)
+_ZIP_ERRORS = (OSError, ValueError, EOFError, RuntimeError, OverflowError, struct.error, zipfile.BadZipFile)
+"""What zipfile raises for damaged, encrypted or foreign files."""
 
 
 def _raw_layers(path: Path) -> dict[str, np.ndarray]:
+    """The layers of a file that an archive keeps: all but position, which depth and camera give."""
     channels, _ = read_exr(path, pad=False)
-    return {
+    layers = {
         layer: np.stack([channels[f"{layer}.{c}"].astype(np.float32) for c in letters], -1)
         for layer, letters in LAYERS.items()
         if layer != "position" and f"{layer}.{letters[0]}" in channels
     }
+    for layer in ("depth", "motion"):
+        if layer not in layers:
+            raise JaxsrError(f"an archive needs the layer {layer!r}", where=path, found=", ".join(layers))
+    for layer in layers:
+        if layer not in CODES:
+            raise JaxsrError(
+                f"an archive cannot hold the layer {layer!r}", where=path, expected=", ".join(CODES)
+            )
+    return layers
 
 
 def _images(
@@ -63,7 +91,7 @@ def pack(
         progress: called with the name and size of each member.
 
     Raises:
-        JaxsrError: too large, or a sequence that cannot be read.
+        JaxsrError: too large; a sequence that cannot be read, or that has what an archive does not hold.
     """
     manifest: dict[str, Any] = {
         "format": FORMAT, "version": VERSION, "color_bits": color_bits, "sequences": {}, "members": {},
@@ -73,8 +101,10 @@ def pack(
     with atomic_path(archive) as temporary, zipfile.ZipFile(temporary, "w", zipfile.ZIP_STORED) as file:
         for name, folder in sequences.items():
             seq = Sequence.open(folder)
-            manifest["sequences"][name] = json.loads((folder / "sequence.json").read_text())
+            manifest["sequences"][name] = read_json(folder / "sequence.json", dict)
             for info, before, resolution, jitter in _images(seq.infos, seq.resolutions):
+                if info.world_from_view is None:
+                    raise JaxsrError(f"an archive needs a camera for frame {info.index}", where=folder)
                 layers = _raw_layers(frame_file(folder, resolution, info.index))
                 blob = encode_frame(layers, info, before, jitter, color_bits)
                 member = f"{name}/{resolution}/{info.index:04d}"
@@ -92,8 +122,7 @@ def pack(
                     )
         file.writestr(zipfile.ZipInfo("manifest.json", _EPOCH), json.dumps(manifest, indent=1))
     digest = file_digest(archive)
-    with atomic_path(archive.with_name(archive.name + ".sha256")) as temporary:
-        temporary.write_text(f"{digest}  {archive.name}\n")
+    write_text(archive.with_name(archive.name + ".sha256"), f"{digest}  {archive.name}\n")
     return digest
 
 
@@ -103,14 +132,9 @@ def read_manifest(archive: Path) -> dict[str, Any]:
     Raises:
         JaxsrError: missing, not an archive of ours, another version, names that lead out of a folder.
     """
-    try:
-        with zipfile.ZipFile(archive) as file:
-            manifest = json.loads(file.read("manifest.json"))
-    except (OSError, KeyError, ValueError, zipfile.BadZipFile) as e:
-        raise JaxsrError("not an archive of a data set", where=archive, found=e) from e
-    if not isinstance(manifest, dict):
-        found = type(manifest).__name__
-        raise JaxsrError("not an archive of a data set", where=archive, expected="a manifest", found=found)
+    with _opened(archive) as file:
+        text = _read_member(file, archive, "manifest.json", JSON_BYTES)
+    manifest = parse_json(text, f"{archive}, manifest.json", dict)
     if manifest.get("format") != FORMAT or manifest.get("version") != VERSION:
         found = f"{manifest.get('format')} {manifest.get('version')}"
         raise JaxsrError(
@@ -123,13 +147,56 @@ def read_manifest(archive: Path) -> dict[str, Any]:
         check_head(head, f"{archive}, {name}")
         if not _stays_inside(name):
             raise JaxsrError(
-                "unsafe name of a sequence", where=archive, expected="a relative path", found=name
+                "unsafe name of a sequence", where=archive, expected="a relative path", found=repr(name)
+            )
+        width, height = head["size"]
+        if width * height > MAX_PIXELS:
+            raise JaxsrError(
+                "the images are too large",
+                where=f"{archive}, {name}",
+                expected=f"at most {MAX_PIXELS} pixels",
+                found=f"{width}x{height}",
             )
     return manifest
 
 
+@contextlib.contextmanager
+def _opened(archive: Path) -> Iterator[zipfile.ZipFile]:
+    with open_file(archive) as stream:
+        try:
+            file = zipfile.ZipFile(stream)
+        except (*_ZIP_ERRORS, KeyError) as e:
+            raise JaxsrError("not an archive of a data set", where=archive, found=e) from e
+        with file:
+            yield file
+
+
+def _read_member(file: zipfile.ZipFile, archive: Path, member: str, limit: int) -> bytes:
+    """The bytes of a member that is stored as it is, and has at most `limit` of them."""
+    try:
+        info = file.getinfo(member)
+    except KeyError as e:
+        raise JaxsrError(f"no member {member!r}", where=archive, fix="fetch the archive again") from e
+    if info.compress_type != zipfile.ZIP_STORED or info.file_size > limit:
+        stored = "stored" if info.compress_type == zipfile.ZIP_STORED else "compressed"
+        raise JaxsrError(
+            f"member {member!r} is not as jaxsr writes it",
+            where=archive,
+            expected=f"at most {limit} bytes, stored without compression",
+            found=f"{info.file_size} bytes, {stored}",
+        )
+    try:
+        return file.read(info)
+    except _ZIP_ERRORS as e:
+        raise JaxsrError(
+            f"member {member!r} cannot be read", where=archive, found=e, fix="fetch the archive again"
+        ) from e
+
+
 def _stays_inside(name: str) -> bool:
-    """Whether a name is a path below the folder that it is joined to, on every system."""
+    """Whether a name is a path below the folder that it is joined to, on every system, and can be shown."""
+    if not name.isprintable():
+        return False
     for path in (PurePosixPath(name), PureWindowsPath(name)):
         if path.anchor or not path.parts or ".." in path.parts:
             return False
@@ -137,9 +204,15 @@ def _stays_inside(name: str) -> bool:
 
 
 def verify(archive: Path) -> None:
-    """Compare the whole with ARCHIVE.sha256, where that exists."""
+    """Compare the whole with ARCHIVE.sha256, where that exists.
+
+    Raises:
+        JaxsrError: they differ, or one cannot be read.
+    """
     beside = archive.with_name(archive.name + ".sha256")
-    if beside.is_file() and beside.read_text(errors="replace").split()[:1] != [file_digest(archive)]:
+    if not beside.exists():
+        return
+    if read_bytes(beside, 4096).split()[:1] != [file_digest(archive).encode()]:
         raise JaxsrError("the checksum does not match", where=archive, expected=f"that of {beside.name}")
 
 
@@ -164,20 +237,21 @@ def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folde
         precision={"motion": "float"},
     )
     images: dict[int, dict[str, dict[str, np.ndarray]]] = {}
-    with zipfile.ZipFile(archive) as file:
+    with _opened(archive) as file:
         for info, before, resolution, jitter in _images(infos, writer.resolutions):
             if writer.has(info.index):
                 continue
             member = f"{name}/{resolution}/{info.index:04d}"
-            try:
-                blob = file.read(member)
-            except (KeyError, zipfile.BadZipFile) as e:
-                raise JaxsrError(f"member {member!r} cannot be read", where=archive, found=e) from e
+            scale = 1 if resolution == "hr" else int(resolution[1:])
+            shape = (head["size"][1] // scale, head["size"][0] // scale)
+            blob = _read_member(file, archive, member, largest_blob(shape))
             if hashlib.sha256(blob).hexdigest() != manifest["members"].get(member):
                 raise JaxsrError(
                     f"member {member!r} is damaged", where=archive, fix="fetch the archive again"
                 )
-            images.setdefault(info.index, {})[resolution] = decode_frame(blob, info, before, jitter)
+            images.setdefault(info.index, {})[resolution] = decode_frame(
+                blob, shape, info, before, jitter, where=f"{archive}, member {member!r}"
+            )
             if len(images[info.index]) == len(writer.resolutions):
                 done = images.pop(info.index)
                 writer.write_frame(info, done.pop("hr"), {int(r[1:]): x for r, x in done.items()})

@@ -6,14 +6,15 @@ What `decode_frame` returns differs from what `encode_frame` was given by at mos
 |---|---|---|
 | color | half float, mantissa rounded to `color_bits` | relative 2^-(color_bits + 1); negatives become 0 |
 | depth | 16-bit logarithm between the image's extremes, 65535 for sky | relative (log range) / 131068 |
-| motion | rest over the camera's motion at that depth, in steps of 1/64 pixel | 1/128 pixel |
-| normal | octahedral, 8 bits a coordinate | 0.95 degrees |
+| motion | difference from the camera's motion at that depth, in steps of 1/64 pixel | 1/128 pixel |
+| normal | octahedral, 8 bits per coordinate | 0.95 degrees |
 | base_color | 8 bits, sRGB curve, clipped to [0, 1] | half a step |
 | roughness, metallic | 8 bits, linear | 1/510 |
 | object_id | exact | 0 |
 
-World position is not stored: it is rebuilt from depth. Of the integer planes, green is taken from red and
-blue; then come the best of four linear predictors, bytes of equal significance together, LZMA.
+World position is not stored: it is rebuilt from depth. The integer planes are coded without loss: green is
+subtracted from red and blue, the best of four linear predictors leaves residuals, their bytes are sorted by
+significance, and LZMA compresses them.
 """
 
 import io
@@ -25,12 +26,28 @@ from typing import Any
 
 import numpy as np
 
+from jaxsr.errors import JaxsrError
+from jaxsr.files import parse_json
 from jaxsr.io.geometry import image_plane, to_pixels, world_position
 from jaxsr.io.images import linear_to_srgb, srgb_to_linear
 from jaxsr.io.writing import FrameInfo
 
 MOTION_STEP = 64.0
 SKY_CODE = 65535
+CODES = {
+    "depth": (1, "<u2"),
+    "motion": (2, "<u4"),
+    "color": (3, "<u2"),
+    "normal": (2, "|u1"),
+    "base_color": (3, "|u1"),
+    "roughness": (1, "|u1"),
+    "metallic": (1, "|u1"),
+    "object_id": (1, "<u2"),
+}
+"""Layer -> the planes that it is stored as: how many, and their type."""
+_DAMAGES = (
+    ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, struct.error, lzma.LZMAError,
+)  # fmt: skip
 _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 4, "lp": 0, "pb": 0}]
 
 
@@ -65,7 +82,7 @@ def restore_depth(code: np.ndarray, limits: list[float]) -> np.ndarray:
 
 
 def quantise_normal(normal: np.ndarray) -> np.ndarray:
-    """Octahedral map (Meyer et al. 2010, "On floating-point normal vectors"), 8 bits a coordinate."""
+    """Octahedral map (Meyer et al. 2010, "On floating-point normal vectors"), 8 bits per coordinate."""
     n = normal / np.maximum(np.abs(normal).sum(-1, keepdims=True), 1e-9)
     folded = (1 - np.abs(n[..., 1::-1])) * np.where(n[..., :2] >= 0, 1, -1)
     return np.rint((np.where(n[..., 2:] < 0, folded, n[..., :2]) * 0.5 + 0.5) * 254).astype(np.uint8)
@@ -136,12 +153,19 @@ def encode_plane(plane: np.ndarray) -> tuple[dict[str, Any], bytes]:
 
 
 def decode_plane(note: Mapping[str, Any], packed: bytes, shape: tuple[int, int]) -> np.ndarray:
-    dtype = np.dtype(note["dtype"])
-    raw = np.frombuffer(lzma.decompress(packed, lzma.FORMAT_RAW, filters=_FILTERS), np.uint8)
+    """The inverse of `encode_plane`; never decompresses more than a plane of this shape needs."""
+    dtype, kind = np.dtype(note["dtype"]), note["kind"]
+    if kind not in range(4):
+        raise ValueError(f"predictor {kind!r}")
+    size = dtype.itemsize * shape[0] * shape[1]
+    data = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_FILTERS).decompress(packed, max_length=size + 1)
+    if len(data) != size:
+        raise ValueError(f"a plane of {'more' if len(data) > size else len(data)} bytes for {size}")
+    raw = np.frombuffer(data, np.uint8)
     parts = raw.reshape(dtype.itemsize, *shape).astype(dtype)
     folded = sum((parts[k] << (8 * k) for k in range(1, dtype.itemsize)), parts[0]).astype(dtype)
     residual = (folded >> 1) ^ (0 - (folded & 1)).astype(dtype)
-    return _unpredict(residual.astype(dtype), note["kind"])
+    return _unpredict(residual.astype(dtype), kind)
 
 
 def _planes_of(code: np.ndarray) -> list[np.ndarray]:
@@ -193,20 +217,75 @@ def encode_frame(
     return struct.pack("<I", len(head)) + head + body.getvalue()
 
 
+def largest_blob(shape: tuple[int, int]) -> int:
+    """Bytes of an image `(h, w)` at most: the notes, and planes that could not be made smaller."""
+    per_pixel = sum(channels * np.dtype(dtype).itemsize for channels, dtype in CODES.values())
+    return (1 << 20) + 2 * per_pixel * shape[0] * shape[1]
+
+
 def decode_frame(
-    blob: bytes, info: FrameInfo, before: FrameInfo, jitter: tuple[float, float]
+    blob: bytes,
+    shape: tuple[int, int],
+    info: FrameInfo,
+    before: FrameInfo,
+    jitter: tuple[float, float],
+    *,
+    where: object = None,
 ) -> dict[str, np.ndarray]:
-    """The inverse of `encode_frame`, float32 layers `[h, w, c]`."""
+    """The inverse of `encode_frame`, float32 layers `[h, w, c]`.
+
+    Args:
+        blob: what `encode_frame` returned, or anything else.
+        shape: the height and width that it must have.
+        info, before, jitter: those that `encode_frame` was given.
+        where: the place that errors name.
+
+    Raises:
+        JaxsrError: it is not an image of this shape.
+    """
+    try:
+        codes, notes = _decode_codes(blob, shape)
+        return _restore(codes, notes, info, before, jitter)
+    except _DAMAGES as e:
+        found = f"no {e}" if isinstance(e, KeyError) else e
+        raise JaxsrError("cannot be decoded", where=where, found=found, fix="fetch the archive again") from e
+
+
+def _decode_codes(blob: bytes, shape: tuple[int, int]) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """The integer arrays of the layers, and the notes about them, checked."""
     (length,) = struct.unpack_from("<I", blob)
-    notes, at = json.loads(blob[4 : 4 + length]), 4 + length
-    shape = (int(notes["shape"][0]), int(notes["shape"][1]))
+    notes, at = parse_json(blob[4 : 4 + length], "notes", dict), 4 + length
+    if notes["shape"] != list(shape):
+        raise ValueError(f"shape {notes['shape']!r} for {list(shape)}")
+    low, high = notes["depth"]
+    if not -64 <= low <= high <= 64:  # logarithms
+        raise ValueError(f"limits of depth {notes['depth']!r}")
+    if notes["color_bits"] not in range(1, 11):
+        raise ValueError(f"color_bits {notes['color_bits']!r}")
     codes = {}
     for name, planes in notes["planes"].items():
+        channels, dtype = CODES[name]
+        if [note["dtype"] for note in planes] != [dtype] * channels:
+            raise ValueError(f"other planes of {name!r} than {channels} of {dtype}")
         decoded = []
         for note in planes:
+            if not 0 <= note["bytes"] <= len(blob) - at:
+                raise ValueError(f"a plane of {note['bytes']} bytes, where {len(blob) - at} are left")
             decoded.append(decode_plane(note, blob[at : at + note["bytes"]], shape))
             at += note["bytes"]
         codes[name] = _code_of(decoded)
+    if "object_id" in codes and codes["object_id"].max() >= len(notes["ids"]):
+        raise ValueError("an object without an id")
+    return codes, notes
+
+
+def _restore(
+    codes: Mapping[str, np.ndarray],
+    notes: Mapping[str, Any],
+    info: FrameInfo,
+    before: FrameInfo,
+    jitter: tuple[float, float],
+) -> dict[str, np.ndarray]:
     depth = restore_depth(codes["depth"][..., 0], notes["depth"])
     layers = {"depth": depth[..., None]}
     rest = np.ascontiguousarray(codes["motion"]).view(np.int32) / MOTION_STEP

@@ -210,7 +210,7 @@ def test_names_that_lead_out_of_the_folder_are_refused(tmp_path, name):
 def test_damaged_manifests_and_checksums(tmp_path):
     head = {"format": archive.FORMAT, "version": archive.VERSION, "members": {}}
     for manifest, words in [
-        ([], "not an archive.*expected a manifest; found list"),
+        ([], r"manifest\.json: bad JSON; expected an object .*; found list"),
         ({"format": "x"}, "another kind of archive"),
         (head, 'damaged manifest; expected "sequences"'),
         (head | {"sequences": []}, 'damaged manifest; expected "sequences"'),
