@@ -96,14 +96,15 @@ def psnr(image: jax.Array, truth: jax.Array, exposure: float) -> jax.Array:
 def _reprojected(pair: Any, sigma_guide: jax.Array, sigma_space: jax.Array) -> jax.Array:
     frame, previous, truth, previous_truth, exposure = pair
     lighting, _ = reproject(
-        demodulate(previous_truth, previous.hr.base_color),
+        demodulate(previous_truth, previous.hr.base_color, surface=jnp.isfinite(previous.hr.depth_linear)),
         frame.hr.motion_px,
         guided.guide(frame.hr),
         guided.guide(previous.hr),
         sigma_guide=sigma_guide,
         sigma_space=sigma_space,
     )
-    return psnr(modulate(lighting, frame.hr.base_color), truth, exposure)
+    surface = jnp.isfinite(frame.hr.depth_linear)
+    return psnr(modulate(lighting, frame.hr.base_color, surface=surface), truth, exposure)
 
 
 def tune_reprojection(pairs: Sequence[Pair]) -> dict[str, Any]:

@@ -114,7 +114,9 @@ def color_input(frame: Frame, options: Options) -> Float[Array, "*b h w 3"]:
     if options.color == "display":
         return to_display(frame.color_linear * exposure)
     assert frame.lr.base_color is not None
-    return compress_lighting(jnp.maximum(demodulate(frame.color_linear * exposure, frame.lr.base_color), 0))
+    surface = jnp.isfinite(frame.lr.depth_linear)
+    lighting = demodulate(frame.color_linear * exposure, frame.lr.base_color, surface=surface)
+    return compress_lighting(jnp.maximum(lighting, 0))
 
 
 def starting_point(frame: Frame, options: Options) -> Float[Array, "H W 3"]:
@@ -123,7 +125,8 @@ def starting_point(frame: Frame, options: Options) -> Float[Array, "H W 3"]:
     lighting = taau.from_working(made.color, frame.exposure)
     if options.color == "lighting":
         return compress_lighting(lighting * frame.exposure)
-    return to_display(modulate(lighting, guided.surface(frame.hr)[0]), frame.exposure)
+    surface = jnp.isfinite(frame.hr.depth_linear)
+    return to_display(modulate(lighting, guided.surface(frame.hr)[0], surface=surface), frame.exposure)
 
 
 def sample_offset(jitter_px: Float[Array, "*b 2"], scale: int) -> Int[Array, "*b 2"]:
@@ -152,7 +155,9 @@ def displayed(
     if options.color == "display":
         return made, from_display(jnp.clip(made, 0, 1)) / exposure
     assert frames.hr.base_color is not None
-    exposed = modulate(expand_lighting(made), frames.hr.base_color)
+    exposed = modulate(
+        expand_lighting(made), frames.hr.base_color, surface=jnp.isfinite(frames.hr.depth_linear)
+    )
     return to_display(exposed), exposed / exposure
 
 
@@ -215,9 +220,9 @@ def method(options: Options | None = None) -> Method:
 
     lr, hr = {"lr.color"}, {f"hr.{name}" for name in o.buffers} | {"hr.motion"}
     if o.color == "lighting" or o.start == "guided":
-        lr, hr = lr | {"lr.base_color"}, hr | {"hr.base_color"}
+        lr, hr = lr | {"lr.base_color", "lr.depth"}, hr | {"hr.base_color", "hr.depth"}
     if o.start == "guided":
-        lr, hr = lr | {"lr.depth", "lr.normal"}, hr | {"hr.depth", "hr.normal"}
+        lr, hr = lr | {"lr.normal"}, hr | {"hr.normal"}
     return Method(
         "fusion-sr",
         "network: the current frame fused with HR G-buffers; reprojection where nothing was rendered",

@@ -64,13 +64,13 @@ def extrapolate(options: Options, state: State, frame: Frame) -> tuple[State, Ar
     """A frame from its G-buffer and the history alone."""
     previous = GBuffer(state.history.depth_linear, frame.hr.motion_px, state.normal, state.base_color)
     lighting, confidence = reproject(
-        demodulate(state.history.image, state.base_color),
+        demodulate(state.history.image, state.base_color, surface=jnp.isfinite(previous.depth_linear)),
         frame.hr.motion_px,
         guide(frame.hr),
         guide(previous),
         **asdict(options),
     )
-    image = modulate(lighting, surface(frame.hr)[0])
+    image = modulate(lighting, surface(frame.hr)[0], surface=jnp.isfinite(frame.hr.depth_linear))
     weight = backward_warp(state.history.weight, frame.hr.motion_px) * confidence
     history = taau.State(image, weight, frame.hr.depth_linear)
     return State(history, *surface(frame.hr)), image

@@ -55,7 +55,8 @@ def same_surface(gbuffer: GBuffer, sigma_guide: float) -> taau.Alike:
 def estimate(frame: Frame, options: Options) -> taau.Estimate:
     """What one frame says of the lighting of each HR pixel, in the working space of TAAU."""
     lr = frame.lr
-    lighting = taau.to_working(demodulate(frame.color_linear, guided.surface(lr)[0]), frame.exposure)
+    lighting = demodulate(frame.color_linear, guided.surface(lr)[0], surface=jnp.isfinite(lr.depth_linear))
+    lighting = taau.to_working(lighting, frame.exposure)
     features = jnp.concatenate([lighting, guided.guide(lr), 1 / lr.depth_linear], -1)
     alike = same_surface(frame.hr, options.sigma_guide)
     return taau.estimate(features, frame.jitter_px, frame.scale, options.temporal, alike)
@@ -74,15 +75,17 @@ def method(options: Options | None = None, reprojection: guided.Options | None =
             return guided.State(history, *guided.surface(hr)), image
         now = estimate(frame, o)
         previous = state.history
+        lighting = demodulate(previous.image, state.base_color, surface=jnp.isfinite(previous.depth_linear))
         before, weight = taau.fetch_history(
-            taau.to_working(demodulate(previous.image, state.base_color), frame.exposure),
+            taau.to_working(lighting, frame.exposure),
             previous.weight,
             previous.depth_linear,
             frame,
             o.temporal,
         )
         blended, weight = taau.accumulate(before, weight, now, o.temporal)
-        image = modulate(taau.from_working(blended, frame.exposure), guided.surface(hr)[0])
+        lighting = taau.from_working(blended, frame.exposure)
+        image = modulate(lighting, guided.surface(hr)[0], surface=jnp.isfinite(hr.depth_linear))
         return guided.State(taau.State(image, weight, hr.depth_linear), *guided.surface(hr)), image
 
     return Method(

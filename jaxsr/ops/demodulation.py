@@ -1,20 +1,24 @@
 """Demodulation: colour = divisor x lighting, so that filters see smooth lighting instead of textures.
 
 The divisor is the base colour (ExtraSS, notes section on G-buffer-guided reprojection), or with `specular`
-that of ExtraNet for glossy scenes, `base + 0.08 specular (1 - metallic)`. All is scene-linear.
+that of ExtraNet for glossy scenes, `base + 0.08 specular (1 - metallic)`. Everything is scene-linear.
 
-Guard: where no channel of the divisor is positive (sky, emitters, missing or NaN base colour) the divisor is
-1, hence lighting is colour; elsewhere each channel is at least `eps`. The guard bounds lighting by
-`color / eps` and the gradient with respect to the base colour by `color / eps^2`; without it a dark texel
-makes one bright speck of lighting that a filter would spread. Among surfaces the divisor is continuous:
-lighting that crosses from a dark to a darker one keeps its scale. `modulate` inverts `demodulate`.
+On a surface each channel of the divisor is at least `eps`, also where the base colour is exactly 0 or NaN.
+The guard bounds lighting by `color / eps` and the gradient with respect to the base colour by
+`color / eps^2`; without it a dark texel makes one bright speck of lighting that a filter would spread. The
+divisor is continuous in the base colour: lighting that a filter carries from a dark surface to a black one
+keeps its scale.
+
+Off the surfaces (sky) the divisor is 1, hence lighting is colour. Only `surface` says what is sky, and it
+comes from depth: `surface=jnp.isfinite(depth_linear)`. A base colour of 0 does not mean sky, because ink,
+rubber and dark screens have it too. `modulate` inverts `demodulate` for equal arguments.
 """
 
 import functools
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from jaxsr.errors import JaxsrError
 
@@ -22,6 +26,7 @@ from jaxsr.errors import JaxsrError
 def demodulation_divisor(
     base_color: Float[Array, "*n 3"],
     *,
+    surface: Bool[Array, "*n 1"] | Float[Array, "*n 1"] | None = None,
     specular: float | Float[Array, ""] | Float[Array, "*n 1"] | None = None,
     metallic: Float[Array, "*n 1"] | None = None,
     eps: float = 0.02,
@@ -29,22 +34,30 @@ def demodulation_divisor(
     """What `demodulate` divides by and `modulate` multiplies with.
 
     Args:
-        base_color: in [0, 1], 0 for sky.
-        specular: in [0, 1] (0.5 for common materials); None for plain base colour.
-        metallic: in [0, 1], 0 if None; it counts only together with `specular`.
+        base_color: in [0, 1]; NaN counts as 0.
+        surface: True (or above 1/2) where a surface is seen, False for sky. None: every pixel is a surface.
+        specular: in [0, 1] (0.5 for common materials), NaN counts as 0; None for plain base colour.
+        metallic: in [0, 1], NaN counts as 0; 0 if None. It only matters together with `specular`.
         eps: smallest divisor of a surface.
 
     Raises:
         JaxsrError: `eps` is not positive.
     """
-    if isinstance(eps, float | int) and eps <= 0:
+    if isinstance(eps, float | int) and not eps > 0:
         raise JaxsrError("bad guard", where="demodulation eps", expected="a positive number", found=eps)
-    divisor = base_color
+    divisor = _nan_to_zero(base_color)
     if specular is not None:
-        dielectric = 1.0 if metallic is None else 1.0 - metallic
-        divisor = divisor + 0.08 * specular * dielectric
-    guarded = jnp.where(divisor >= eps, divisor, eps)  # eps for NaN
-    return jnp.where(jnp.any(divisor > 0, axis=-1, keepdims=True), guarded, 1.0)
+        dielectric = 1.0 if metallic is None else 1.0 - _nan_to_zero(metallic)
+        divisor = divisor + 0.08 * _nan_to_zero(specular) * dielectric
+    divisor = jnp.where(divisor >= eps, divisor, eps)
+    if surface is None:
+        return divisor
+    return jnp.where(jnp.asarray(surface, jnp.float32) > 0.5, divisor, 1.0)
+
+
+def _nan_to_zero(x: Array | float) -> Array:
+    # Before any product: 0 times NaN would be a NaN gradient.
+    return jnp.where(jnp.isnan(x), 0.0, x)
 
 
 @functools.partial(jax.jit, static_argnames=("eps",))
@@ -52,12 +65,15 @@ def demodulate(
     color_linear: Float[Array, "*n 3"],
     base_color: Float[Array, "*n 3"],
     *,
+    surface: Bool[Array, "*n 1"] | Float[Array, "*n 1"] | None = None,
     specular: float | Float[Array, ""] | Float[Array, "*n 1"] | None = None,
     metallic: Float[Array, "*n 1"] | None = None,
     eps: float = 0.02,
 ) -> Float[Array, "*n 3"]:
     """Lighting: colour over the divisor. Arguments as for `demodulation_divisor`."""
-    return color_linear / demodulation_divisor(base_color, specular=specular, metallic=metallic, eps=eps)
+    return color_linear / demodulation_divisor(
+        base_color, surface=surface, specular=specular, metallic=metallic, eps=eps
+    )
 
 
 @functools.partial(jax.jit, static_argnames=("eps",))
@@ -65,9 +81,12 @@ def modulate(
     lighting: Float[Array, "*n 3"],
     base_color: Float[Array, "*n 3"],
     *,
+    surface: Bool[Array, "*n 1"] | Float[Array, "*n 1"] | None = None,
     specular: float | Float[Array, ""] | Float[Array, "*n 1"] | None = None,
     metallic: Float[Array, "*n 1"] | None = None,
     eps: float = 0.02,
 ) -> Float[Array, "*n 3"]:
     """Colour of lighting: lighting times the divisor. Arguments as for `demodulation_divisor`."""
-    return lighting * demodulation_divisor(base_color, specular=specular, metallic=metallic, eps=eps)
+    return lighting * demodulation_divisor(
+        base_color, surface=surface, specular=specular, metallic=metallic, eps=eps
+    )
