@@ -147,11 +147,13 @@ def test_a_network_that_passes_colour_on_gives_the_colour(color, exposure):
     enlarged = functools.partial(upsample, scale=2, mode="nearest")
     flat = [jnp.asarray(np.random.default_rng(s).random((8, 12, 3), np.float32)) for s in (0, 1)]
     linear = (2.0 / exposure) * flat[0]
+    base, depth = flat[1].at[:2].set(0), jnp.ones((8, 12, 1)).at[:2].set(jnp.inf)  # sky, with black below it
+    base = base.at[2].set(0)
     frame = frame._replace(
         color_linear=linear,
         exposure=jnp.asarray(exposure),
-        lr=frame.lr._replace(base_color=flat[1].at[:2].set(0)),  # sky has no base colour
-        hr=frame.hr._replace(base_color=enlarged(flat[1].at[:2].set(0))),
+        lr=frame.lr._replace(base_color=base, depth_linear=depth),
+        hr=frame.hr._replace(base_color=enlarged(base), depth_linear=enlarged(depth)),
     )
     shown, made = displayed(lambda c, g, o: enlarged(c), batched(frame), options)
     np.testing.assert_allclose(made[0], enlarged(linear), rtol=2e-3, atol=1e-5)
