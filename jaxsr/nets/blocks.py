@@ -91,19 +91,26 @@ def count_channels(buffers: Sequence[str]) -> int:
     return sum(CHANNELS[name] for name in buffers)
 
 
+MOST = {"scale": 16, "groups": 64, "blocks": 64, "features": 1024, "previous": 16, "frames": 64}
+"""The largest sizes of networks. Files of weights bring any number, and even the plan of a network with ten
+million blocks takes hours; the largest published network here has 10 groups of 20 blocks and 128 features."""
+
+
 def check_shape(scale: int | None, down_kernel: int) -> None:
     """Raise JaxsrError unless networks of this scale and stride-2 kernel exist."""
-    if scale is not None and scale < 1:
-        raise JaxsrError("bad scale", where="scale", expected="a whole number of at least 1", found=scale)
+    if scale is not None:
+        check_counts(scale=scale)
     if down_kernel not in (2, 3):
         raise JaxsrError("bad kernel", where="down_kernel", expected="2 | 3", found=down_kernel)
 
 
-def check_counts(**counts: int) -> None:
-    """Raise JaxsrError, which names the first bad one, unless there is at least one of each."""
+def check_counts(least: int = 1, **counts: int) -> None:
+    """Raise JaxsrError, which names the first bad one, unless all are whole, from `least` to `MOST`."""
     for name, count in counts.items():
-        if count < 1:
-            raise JaxsrError(f"bad {name}", where=name, expected="a whole number of at least 1", found=count)
+        most = MOST.get(name, max(MOST.values()))
+        if type(count) is not int or not least <= count <= most:
+            bound = f"at most {most}" if type(count) is int and count > most else f"at least {least}"
+            raise JaxsrError(f"bad {name}", where=name, expected=f"a whole number of {bound}", found=count)
 
 
 def check_channels(gbuffer: Float[Array, "b h w c"], channels: int) -> None:

@@ -27,7 +27,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.nets.blocks import ConvPair, ShallowFeatures, conv, conv_beside
+from jaxsr.nets.blocks import ConvPair, ShallowFeatures, check_counts, conv, conv_beside
 from jaxsr.ops import upsample
 
 RGBD = 4
@@ -46,14 +46,11 @@ class NSRR(nnx.Module):
         dtype: what convolutions compute in; parameters and output stay float32.
 
     Raises:
-        JaxsrError: no previous frame.
+        JaxsrError: no previous frame, or more than 16.
     """
 
     def __init__(self, *, previous: int = 4, dtype: DTypeLike = jnp.float32, rngs: nnx.Rngs):
-        if previous < 1:
-            raise JaxsrError(
-                "bad number of frames", where="previous", expected="a whole number from 1", found=previous
-            )
+        check_counts(previous=previous)
         self.previous, self.dtype = previous, dtype
         frames = 1 + previous
         self.features = ShallowFeatures(RGBD, CHANNELS - RGBD, dtype=dtype, rngs=rngs)

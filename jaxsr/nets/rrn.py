@@ -18,7 +18,6 @@ from flax import nnx
 from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
-from jaxsr.errors import JaxsrError
 from jaxsr.nets.blocks import LoopConv, check_counts
 from jaxsr.ops import pixel_shuffle, pixel_unshuffle, upsample
 
@@ -28,8 +27,7 @@ INIT = nnx.initializers.variance_scaling(0.02, "fan_in", "normal")
 
 def check_sizes(scale: int, blocks: int, features: int) -> None:
     """Raise JaxsrError unless there is such a network."""
-    if scale < 2:
-        raise JaxsrError("bad scale", where="scale", expected="a whole number of at least 2", found=scale)
+    check_counts(least=2, scale=scale)
     check_counts(blocks=blocks, features=features)
 
 

@@ -1,6 +1,5 @@
 """Published weights to a file of ours: reading (`io`), names and layouts (`nets`), the method (`methods`)."""
 
-import hashlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +8,7 @@ from flax import nnx
 
 import jaxsr
 from jaxsr.errors import JaxsrError
+from jaxsr.files import file_digest
 from jaxsr.methods import build
 from jaxsr.weights.file import into, save_weights
 from jaxsr.weights.names import PUBLISHED, method_of, translate
@@ -67,7 +67,7 @@ def convert_published(
         "arguments": arguments,
         "scale": told,
         "jaxsr": jaxsr.__version__,
-        "source": {"file": source.name, "sha256": hashlib.sha256(source.read_bytes()).hexdigest()},
+        "source": {"file": source.name, "sha256": file_digest(source)},
     }
     save_weights(out, state, header, half=half)
     return header

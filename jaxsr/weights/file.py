@@ -6,8 +6,10 @@ A file holds one array a parameter or batch statistic, named by its place in the
 size; loaded, they are float32 either way. `jaxsr.weights.torch` reads the weights of other programs.
 """
 
+import itertools
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -18,12 +20,16 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path
+from jaxsr.files import atomic_path, open_file, parse_json
+from jaxsr.weights.archives import Budget, check_file
+from jaxsr.weights.pickles import shortened
 
 State: TypeAlias = Any
 """An `nnx.State`; not annotated as one, for its own annotations are of a kind that beartype rejects."""
 KEY = "jaxsr"
 """Of the metadata entry that holds the header."""
+HEADER_BYTES = 16 << 20
+"""Of all that a safetensors file says about its arrays, which takes about 100 bytes per array."""
 
 
 def flatten(state: State) -> dict[str, np.ndarray]:
@@ -54,7 +60,7 @@ def save_weights(
     dtype = np.float16 if half else np.float32
     arrays = {}
     for name, array in (flatten(state) if isinstance(state, nnx.State) else state).items():
-        with np.errstate(over="ignore"):  # told below, by name
+        with np.errstate(over="ignore"):  # the error below names the array
             arrays[name] = np.ascontiguousarray(array, dtype)
         if not np.isfinite(arrays[name]).all():
             raise JaxsrError(
@@ -82,24 +88,27 @@ def load_weights(path: str | Path) -> tuple[dict[str, np.ndarray], dict[str, Any
         Arrays by name, float32, and the header.
 
     Raises:
-        JaxsrError: missing, truncated, not safetensors, or without jaxsr's header.
+        JaxsrError: missing, truncated, not safetensors, without jaxsr's header, or with a value that is not
+            finite; it names the first array that has one.
     """
     path = Path(path)
     arrays, metadata = read_safetensors(path)
-    try:
-        header = json.loads(metadata[KEY])
-    except KeyError:
-        header = None
-    except ValueError as e:
-        raise JaxsrError("the header of the weights is damaged", where=path, found=e) from e
-    if not isinstance(header, dict) or "method" not in header:
+    header = None
+    if KEY in metadata:
+        try:
+            header = parse_json(metadata[KEY], path, limit=HEADER_BYTES)
+        except JaxsrError as e:
+            found = e.what if e.found is None else f"{e.what}: {e.found}"
+            raise JaxsrError("the header of the weights is damaged", where=path, found=found) from e
+    if not isinstance(header, dict) or not isinstance(header.get("method"), str):
         raise JaxsrError(
             "the file does not say which method its weights are for",
             where=path,
             expected=f"a metadata entry {KEY!r} that names the method",
-            found=", ".join(sorted(metadata)) or "no metadata",
+            found=few(sorted(metadata)) or "no metadata",
             fix="convert published weights with `jaxsr convert-weights`",
         )
+    check_finite(arrays, path)
     return arrays, header
 
 
@@ -109,12 +118,18 @@ def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]
     Raises:
         JaxsrError: missing, truncated, not safetensors, or with arrays of types that NumPy does not know.
     """
-    check_file(path)
+    budget = Budget(check_file(path))
     try:
+        with open_file(path) as opened:
+            if (size := int.from_bytes(opened.read(8), "little")) > HEADER_BYTES:
+                raise ValueError(f"a header of {size} bytes, more than {HEADER_BYTES}")
+        arrays = {}
         with safe_open(path, framework="np") as file:
             metadata = file.metadata() or {}
-            arrays = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except SafetensorError as e:
+            for name in file.keys():  # noqa: SIM118 (not a dict)
+                budget.spend(4 * math.prod(file.get_slice(name).get_shape()))
+                arrays[name] = float32(file.get_tensor(name))
+    except (SafetensorError, OSError, ValueError) as e:
         raise JaxsrError(
             "cannot read the weights", where=path, expected="a whole safetensors file", found=_words(e)
         ) from e
@@ -122,15 +137,26 @@ def read_safetensors(path: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]
         raise JaxsrError(
             "cannot read the weights", where=path, expected="float16, float32 or float64", found=e
         ) from e
-    return {name: np.asarray(array, np.float32) for name, array in arrays.items()}, metadata
+    return arrays, metadata
 
 
-def check_file(path: Path) -> None:
-    """Raise JaxsrError unless there is a file of that name."""
-    if not path.is_file():
-        raise JaxsrError(
-            "no such file of weights" if not path.exists() else "a folder, not a file of weights", where=path
-        )
+def float32(array: np.ndarray) -> np.ndarray:
+    """The array as float32; what is too large becomes infinite, for `check_finite` to find."""
+    with np.errstate(over="ignore"):
+        return np.asarray(array, np.float32)
+
+
+def check_finite(arrays: Mapping[str, np.ndarray], where: object) -> None:
+    """Raise JaxsrError, which names the first bad array, unless all values are finite."""
+    for name, array in arrays.items():
+        if not np.isfinite(array).all():
+            raise JaxsrError(
+                f"{shortened(name)} is not finite",
+                where=where,
+                expected="finite float32 values",
+                found="NaN or infinity",
+                fix="use weights from before the training diverged",
+            )
 
 
 def into(state: State, arrays: Mapping[str, np.ndarray], where: object = "weights") -> State:
@@ -148,7 +174,7 @@ def into(state: State, arrays: Mapping[str, np.ndarray], where: object = "weight
     missing = [name for name in flat if name not in arrays]
     extra = [name for name in arrays if name not in flat]
     if missing or extra:
-        what = [f"{kind} {_few(names)}" for kind, names in (("lacks", missing), ("has", extra)) if names]
+        what = [f"{kind} {few(names)}" for kind, names in (("lacks", missing), ("has", extra)) if names]
         raise JaxsrError(
             "the weights do not fit the network",
             where=where,
@@ -171,8 +197,10 @@ def into(state: State, arrays: Mapping[str, np.ndarray], where: object = "weight
     return nnx.from_flat_state(filled)
 
 
-def _few(names: list[str]) -> str:
-    return ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
+def few(names: Collection[str]) -> str:
+    """The first names out of a file, and how many more there are, for a message."""
+    first = ", ".join(shortened(name) for name in itertools.islice(names, 3))
+    return first + (f" and {len(names) - 3} more" if len(names) > 3 else "")
 
 
 def _extreme(array: np.ndarray) -> object:

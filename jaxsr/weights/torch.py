@@ -1,17 +1,14 @@
 """Weights that others published, as arrays by name: `.pth`, `.npz` and `.safetensors`. No code in them runs.
 
 A `.pth` file of PyTorch 1.6 or later is a ZIP archive of one pickle, `data.pkl`, and the raw bytes of each
-storage. A pickle may call whatever it names. The reader here lets it name ordered dictionaries, tensors and
-storages only, puts inert records in the place of the last two, and refuses every other name before it is
-looked up. Names and layouts stay the publisher's: `jaxsr.weights.names` translates.
+storage. A pickle may call whatever it names. `jaxsr.weights.pickles` lets it name ordered dictionaries,
+tensors and storages only, and refuses every other name. Arrays take no more memory than a file of that size
+can hold (`jaxsr.weights.archives`). Names and layouts stay the publisher's: `jaxsr.weights.names` translates.
 """
 
 import io
 import math
-import pickle
 import zipfile
-from collections import OrderedDict
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,22 +16,28 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.weights.file import KEY, check_file, read_safetensors
+from jaxsr.weights.archives import Budget, check_file, open_archive, read_member
+from jaxsr.weights.file import KEY, check_finite, few, float32, read_safetensors
+from jaxsr.weights.pickles import Known, Name, shortened, unpickle
 
 _STORAGES = {
-    "FloatStorage": np.float32,
-    "DoubleStorage": np.float64,
-    "HalfStorage": np.float16,
-    "BFloat16Storage": jnp.bfloat16,
-    "LongStorage": np.int64,
-    "IntStorage": np.int32,
-    "ShortStorage": np.int16,
-    "CharStorage": np.int8,
-    "ByteStorage": np.uint8,
-    "BoolStorage": np.bool_,
+    Name("torch", "FloatStorage"): np.float32,
+    Name("torch", "DoubleStorage"): np.float64,
+    Name("torch", "HalfStorage"): np.float16,
+    Name("torch", "BFloat16Storage"): jnp.bfloat16,
+    Name("torch", "LongStorage"): np.int64,
+    Name("torch", "IntStorage"): np.int32,
+    Name("torch", "ShortStorage"): np.int16,
+    Name("torch", "CharStorage"): np.int8,
+    Name("torch", "ByteStorage"): np.uint8,
+    Name("torch", "BoolStorage"): np.bool_,
 }
 _WRAPPERS = ("state_dict", "model_state_dict", "model", "net", "params")
 """Entries under which checkpoints keep the weights among other things."""
+_MOST_WRAPPERS = 4
+"""Entries inside of entries."""
+_MOST_AXES = 32
+"""Of a tensor; a network has at most 4."""
 
 
 def read_published(path: str | Path) -> dict[str, np.ndarray]:
@@ -48,7 +51,8 @@ def read_published(path: str | Path) -> dict[str, np.ndarray]:
         Arrays by their published names, without a leading "module.", float32, in the layout of the file.
 
     Raises:
-        JaxsrError: missing, damaged, of another kind, without arrays, or a pickle with a forbidden name.
+        JaxsrError: missing, damaged, of another kind, without arrays, with a value that is not finite, or a
+            pickle with a forbidden name.
     """
     path = Path(path)
     check_file(path)
@@ -65,7 +69,9 @@ def read_published(path: str | Path) -> dict[str, np.ndarray]:
         raise JaxsrError("no weights in the file", where=path)
     # torch.nn.DataParallel wraps a network in an attribute of this name.
     prefix = "module." if all(name.startswith("module.") for name in arrays) else ""
-    return {name.removeprefix(prefix): np.asarray(array, np.float32) for name, array in arrays.items()}
+    arrays = {name.removeprefix(prefix): float32(array) for name, array in arrays.items()}
+    check_finite(arrays, path)
+    return arrays
 
 
 def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
@@ -75,68 +81,95 @@ def _read_safetensors(path: Path) -> dict[str, np.ndarray]:
     return arrays
 
 
+# --- .npz ------------------------------------------------------------------------------------------------
+
+
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    budget = Budget(check_file(path))
     try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as e:
+        with open_archive(path) as archive:
+            members = [name for name in archive.namelist() if name.endswith(".npy")]
+            arrays = {
+                name.removesuffix(".npy"): _npy(read_member(archive, name, budget), budget)
+                for name in members
+            }
+    except JaxsrError:
+        raise
+    except Exception as e:  # a damaged archive can fail in any way
         raise JaxsrError(
-            "cannot read the weights", where=path, expected="a whole .npz file of plain arrays", found=e
+            "cannot read the weights",
+            where=path,
+            expected="a whole .npz file of plain arrays",
+            found=_told(e),
         ) from e
     chosen = {name.removeprefix("sd/"): a for name, a in arrays.items() if name.startswith("sd/")}
     return chosen or arrays
 
 
-class _Storage(NamedTuple):
-    dtype: Any
+def _npy(content: bytes, budget: Budget) -> np.ndarray:
+    """The array in a .npy file, whose header says no more than what follows it."""
+    file = io.BytesIO(content)
+    version = np.lib.format.read_magic(file)
+    if version not in _NPY_HEADERS:
+        raise ValueError(f"version {version} of the .npy format")
+    shape, is_fortran, dtype = _NPY_HEADERS[version](file)
+    if dtype.kind not in "fiub":
+        raise ValueError(f"an array of {dtype}, which are not plain numbers")
+    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(content) - file.tell():
+        raise ValueError(f"an array of shape {shape} whose file is of another size")
+    budget.spend(max(0, 4 - dtype.itemsize) * math.prod(shape))  # what it grows as float32
+    flat = np.frombuffer(content, dtype, offset=file.tell())
+    return flat.reshape(shape, order="F" if is_fortran else "C")
+
+
+_NPY_HEADERS = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
+
+
+# --- .pth ------------------------------------------------------------------------------------------------
 
 
 class _Tensor(NamedTuple):
     """What `torch._utils._rebuild_tensor_v2` is called with; the layout in elements of the storage."""
 
-    storage: Any
-    offset: Any
-    size: Any
-    stride: Any
-    requires_grad: Any = None
-    hooks: Any = None
-    metadata: Any = None
+    dtype: np.dtype
+    key: str
+    offset: int
+    size: tuple[int, ...]
+    stride: tuple[int, ...]
 
 
-def _tensor(*arguments: Any) -> _Tensor:
-    """Not the class itself: a pickle may set attributes of what it names."""
-    return _Tensor(*arguments)
+def _tensor(arguments: tuple[Any, ...]) -> _Tensor:
+    """A record of a tensor. The storage is ("storage", type, key, device, length)."""
+    storage, offset, size, stride, *_ = arguments
+    _, kind, key, *_ = storage
+    layout = (offset, *size, *stride)
+    if len(size) != len(stride) or len(size) > _MOST_AXES:
+        raise ValueError("a tensor of impossible layout")
+    if not all(type(n) is int and n >= 0 for n in layout):
+        raise ValueError("a tensor of impossible layout")
+    if kind not in _STORAGES or not isinstance(key, str):
+        raise ValueError("a tensor without a storage")
+    return _Tensor(np.dtype(_STORAGES[kind]), key, offset, tuple(size), tuple(stride))
 
 
-_ALLOWED = {
-    ("collections", "OrderedDict"): OrderedDict,
-    ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-    **{("torch", name): _Storage(np.dtype(dtype)) for name, dtype in _STORAGES.items()},
+def _dictionary(arguments: tuple[Any, ...]) -> dict[str, Any]:
+    if arguments:
+        raise ValueError("a dictionary that is made of something")
+    return {}
+
+
+_KNOWN: Known = {
+    Name("collections", "OrderedDict"): _dictionary,
+    Name("torch._utils", "_rebuild_tensor_v2"): _tensor,
+    **dict.fromkeys(_STORAGES),
 }
 
 
-class _Unpickler(pickle.Unpickler):
-    """Knows three kinds of names; `persistent_load` keeps the record of a storage as it is."""
-
-    def __init__(self, file: Any, path: Path):
-        super().__init__(file)
-        self.path = path
-
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ALLOWED:
-            raise JaxsrError(
-                f"the pickle names {module}.{name}, which could run code",
-                where=self.path,
-                expected="tensors, dictionaries, numbers and text",
-                fix="save the state dictionary alone: torch.save(model.state_dict(), path)",
-            )
-        return _ALLOWED[module, name]
-
-    def persistent_load(self, pid: Any) -> Any:
-        return pid
-
-
 def _read_pth(path: Path) -> dict[str, np.ndarray]:
+    budget = Budget(check_file(path))
     if not zipfile.is_zipfile(path):
         raise JaxsrError(
             "cannot read the weights",
@@ -146,69 +179,71 @@ def _read_pth(path: Path) -> dict[str, np.ndarray]:
             fix="load it in PyTorch and save its state dictionary again",
         )
     try:
-        with zipfile.ZipFile(path) as archive:
-            pickles = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
-            if len(pickles) != 1:
-                raise ValueError(f"{len(pickles)} members data.pkl")
-            folder = pickles[0].removesuffix("data.pkl")
-            if (
-                f"{folder}byteorder" in archive.namelist()
-                and _member(archive, f"{folder}byteorder") == b"big"
-            ):
-                raise ValueError("big-endian numbers")
-            content = _Unpickler(io.BytesIO(_member(archive, pickles[0])), path).load()
-            state = _state_dict(content, path)
-            storages: dict[str, np.ndarray] = {}
-            return {name: _array(tensor, archive, folder, storages) for name, tensor in state.items()}
+        with open_archive(path) as archive:
+            return _tensors(archive, path, budget)
     except JaxsrError:
         raise
-    except Exception as e:  # a damaged pickle can fail in any way
+    except Exception as e:  # a damaged archive can fail in any way
         raise JaxsrError(
             "cannot read the weights",
             where=path,
             expected="a whole .pth file, as torch.save writes it",
-            found=f"{type(e).__name__}: {e}",
+            found=_told(e),
         ) from e
 
 
+def _tensors(archive: zipfile.ZipFile, path: Path, budget: Budget) -> dict[str, np.ndarray]:
+    pickles = [name for name in archive.namelist() if name.rpartition("/")[2] == "data.pkl"]
+    if len(pickles) != 1:
+        raise ValueError(f"{len(pickles)} members data.pkl")
+    folder = pickles[0].removesuffix("data.pkl")
+    order = f"{folder}byteorder"
+    if order in archive.namelist() and _stored(archive, order, budget) == b"big":
+        raise ValueError("big-endian numbers")
+    content = unpickle(_stored(archive, pickles[0], budget), _KNOWN, path)
+    storages: dict[str, np.ndarray] = {}
+    arrays = {}
+    for name, tensor in _state_dict(content, path).items():
+        where = f"{folder}data/{tensor.key}"
+        if where not in storages:
+            storages[where] = np.frombuffer(_stored(archive, where, budget), np.uint8)
+        arrays[name] = _array(tensor, storages[where].view(tensor.dtype), budget)
+    return arrays
+
+
 def _state_dict(content: Any, path: Path) -> dict[str, _Tensor]:
-    """The dictionary of tensors in a checkpoint."""
-    if isinstance(content, Mapping):
-        tensors = {k: v for k, v in content.items() if isinstance(k, str) and isinstance(v, _Tensor)}
-        if tensors:
+    """The dictionary of tensors in a checkpoint, which may be an entry of an entry."""
+    inner = content
+    for _ in range(_MOST_WRAPPERS):
+        if not isinstance(inner, dict):
+            break
+        if tensors := {k: v for k, v in inner.items() if isinstance(k, str) and isinstance(v, _Tensor)}:
             return tensors
-        for name in _WRAPPERS:
-            if isinstance(content.get(name), Mapping):
-                return _state_dict(content[name], path)
+        inner = next((inner[name] for name in _WRAPPERS if isinstance(inner.get(name), dict)), None)
     raise JaxsrError(
         "no state dictionary in the file",
         where=path,
         expected="tensors by name, or an entry " + " | ".join(_WRAPPERS),
-        found=", ".join(map(str, list(content)[:5]))
-        if isinstance(content, Mapping)
-        else type(content).__name__,
+        found=few([str(k) for k in content]) if isinstance(content, dict) else type(content).__name__,
     )
 
 
-def _member(archive: zipfile.ZipFile, name: str) -> bytes:
-    if archive.getinfo(name).compress_type != zipfile.ZIP_STORED:  # a small file must not become a huge one
+def _stored(archive: zipfile.ZipFile, name: str, budget: Budget) -> bytes:
+    if archive.getinfo(name).compress_type != zipfile.ZIP_STORED:  # PyTorch compresses nothing
         raise ValueError(f"{name} is compressed")
-    return archive.read(name)
+    return read_member(archive, name, budget)
 
 
-def _array(
-    tensor: _Tensor, archive: zipfile.ZipFile, folder: str, storages: dict[str, np.ndarray]
-) -> np.ndarray:
-    _, (dtype,), key, *_ = tensor.storage
-    if key not in storages:
-        storages[key] = np.frombuffer(_member(archive, f"{folder}data/{key}"), dtype)
-    flat = storages[key]
-    size, stride = tuple(tensor.size), tuple(tensor.stride)
-    if len(size) != len(stride) or min((tensor.offset, *size, *stride), default=0) < 0:
-        raise ValueError("a tensor of impossible layout")
-    last = tensor.offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True))
-    if 0 not in size and max(last + 1, math.prod(size)) > flat.size:  # a step of 0 repeats without end
+def _array(tensor: _Tensor, flat: np.ndarray, budget: Budget) -> np.ndarray:
+    size, stride, step = tensor.size, tensor.stride, tensor.dtype.itemsize
+    count = math.prod(size)
+    last = tensor.offset + sum((n - 1) * k for n, k in zip(size, stride, strict=True))
+    if count and max(last + 1, count) > flat.size:  # a stride of 0 repeats without end
         raise ValueError("a tensor that is larger than its storage")
-    window = flat[tensor.offset :] if 0 not in size else flat[:0]
-    view = np.lib.stride_tricks.as_strided(window, size, [step * dtype.itemsize for step in stride])
-    return view.astype(np.float32)
+    budget.spend(4 * count)
+    window = flat[tensor.offset :] if count else flat[:0]
+    return np.lib.stride_tricks.as_strided(window, size, [k * step for k in stride]).astype(np.float32)
+
+
+def _told(error: Exception) -> str:
+    return shortened(f"{type(error).__name__}: {error}", 200)

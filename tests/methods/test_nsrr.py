@@ -190,7 +190,7 @@ def test_maps_that_do_not_fit_are_named():
     for bad in ((current, previous[:, 1:]), (current[..., 1:], previous[..., 1:])):
         with pytest.raises(JaxsrError, match=r"previous: maps of the frames do not fit together; expected"):
             net.reconstruct(*bad)
-    with pytest.raises(JaxsrError, match="previous: bad number of frames"):
+    with pytest.raises(JaxsrError, match="previous: bad previous"):
         NSRR(previous=0, rngs=nnx.Rngs(0))
 
 
