@@ -24,7 +24,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description, run_demo
 from jaxsr.files import atomic_path
 from jaxsr.io.images import write_png
-from jaxsr.progress import bars
+from jaxsr.progress import Bars
 from jaxsr.report.embedding import ImageOrPath, to_bytes
 from jaxsr.report.results import SequenceResult
 from jaxsr.report.tables import as_json, best, cell, duration, header, summary
@@ -183,7 +183,7 @@ def picture(sections: list[SequenceResult], task: str, frame: int) -> np.ndarray
 def main(config: Config) -> None:
     start = time.time()
     sections: list[SequenceResult] = []
-    with tempfile.TemporaryDirectory() as folder, bars() as progress:
+    with tempfile.TemporaryDirectory() as folder, Bars() as progress:
         for scale in config.scales:
             paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)
             out = Path(folder) / f"x{scale}"

@@ -4,6 +4,7 @@ A mistake in the input is one line on stderr and exit status 2. Heavy imports wa
 that `jaxsr --help` answers at once.
 """
 
+import io
 import json as json_module
 import os
 import sys
@@ -14,7 +15,7 @@ import tyro
 from tyro.conf import Positional
 
 from jaxsr.errors import JaxsrError
-from jaxsr.progress import bars
+from jaxsr.progress import Bars
 
 app = tyro.extras.SubcommandApp()
 
@@ -40,7 +41,7 @@ def demo(
     from jaxsr.evaluation.demo import run_demo
     from jaxsr.report.tables import rich_tables
 
-    with bars() as progress:
+    with Bars() as progress:
         sequences = unpack_sample(out / "sample", "test", scenes, scale, progress)
         sections = run_demo(out, sequences, scale=scale, lpips=lpips, progress=progress)
     console = Console()
@@ -105,7 +106,7 @@ def compare(
     from jaxsr.evaluation.measuring import metrics_with
     from jaxsr.report.tables import rich_tables
 
-    with bars() as progress:
+    with Bars() as progress:
         section = compare_folders(
             folders,
             truth,
@@ -146,7 +147,7 @@ def upscale(
     opened = Sequence.open(sequence)
     scale = scale or max(opened.scales, default=1)
     ready = find_method(method, scale)
-    with bars() as progress:
+    with Bars() as progress:
         timing = upscale_sequence(
             opened, ready, out, scale=scale, every=every, advance=progress("frames", len(opened))
         )
@@ -191,7 +192,7 @@ def evaluate(
     from jaxsr.report.tables import rich_tables
 
     settings = Settings(scale, every, warmup, metrics_with(lpips))
-    with bars() as progress:
+    with Bars() as progress:
         sections = evaluate_methods(
             sequences,
             [name.strip() for name in methods.split(",") if name.strip()],
@@ -237,30 +238,16 @@ def render(
         blender: a Blender program, or a Python that has the bpy module; else JAXSR_BLENDER, else `blender`.
         threads: of the renderer; all cores by default.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-
     from jaxsr.blender.render import Progress as RenderProgress
     from jaxsr.blender.render import render as render_scene
 
     bounds = _frame_range(frames)
-    columns = (
-        TextColumn("frames"),
-        BarColumn(),
-        TextColumn("{task.fields[count]}"),
-        TimeElapsedColumn(),
-        TextColumn("left"),
-        TimeRemainingColumn(),
-        TextColumn("{task.fields[message]}"),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
-        task = bar.add_task("frames", total=None, message="starting Blender", count="")
+    with Bars() as bars:
+        bar = bars.start("frames", None, unit="frame")
+        bar.update(0, "starting Blender")
 
         def show(at: RenderProgress) -> None:
-            speed = bar.tasks[0].speed
-            rate = f"  {60 * speed:.1f} frames/min" if speed else ""
-            count = f"{at.done_frames:.1f}/{at.total_frames}{rate}"
-            bar.update(task, total=at.total_frames, completed=at.done_frames, message=at.message, count=count)
+            bar.update(at.done_frames, at.message, total=at.total_frames)
 
         render_scene(
             scene,
@@ -329,6 +316,9 @@ def _frame_range(text: str | None) -> tuple[int, int] | None:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 and one line on bad input."""
     given = sys.argv[1:] if arguments is None else arguments
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # what a stream cannot show becomes "?", and no error
+            stream.reconfigure(errors="replace")
     try:
         if given[:1] == ["train"]:
             from jaxsr.training.command import run

@@ -1,6 +1,10 @@
 """The command line: what it prints, what it exits with, and one clear line for every bad input."""
 
 import json
+import os
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -284,3 +288,18 @@ def test_demo_errors(capsys, tmp_path, monkeypatch):
     monkeypatch.setattr("jaxsr.data.sample.sample_folder", lambda: tmp_path / "none")
     assert "sample is missing" in error_line(capsys, "demo", "-o", tmp_path / "d")
     assert not (tmp_path / "d").exists()
+
+
+def test_a_stdout_that_knows_only_ascii(tmp_path):
+    sequence = make_sequence(tmp_path / "größe", size=(32, 24), frames=1, license="© – ∞")
+    done = subprocess.run(
+        [sys.executable, "-c", "from jaxsr.cli import main; main()", "inspect", sequence.path],
+        env=os.environ | {"PYTHONIOENCODING": "ascii", "JAX_PLATFORMS": "cpu"},
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        timeout=120,
+        check=False,
+    )
+    assert done.returncode in (0, 1), done.stderr.decode()
+    assert b"gr??e" in done.stdout or b"gr?" in done.stdout
+    assert b"Traceback" not in done.stderr

@@ -13,7 +13,7 @@ from jaxsr.evaluation.evaluate import evaluate
 from jaxsr.evaluation.running import Settings
 from jaxsr.methods import LEARNED, Learned, Method
 from jaxsr.ops import from_display, sample_jittered, to_display
-from jaxsr.progress import bars
+from jaxsr.progress import Bars
 from jaxsr.training import TrainConfig, train
 
 
@@ -48,7 +48,7 @@ LEARNED["mine"] = Learned(make_dataclass("Options", []), lambda _: MINE)  # how 
 def main(steps: int = 150, out: Path = Path("example")) -> None:
     weights = train(MINE, TrainConfig(steps=steps, out=out / "mine"))
     clips, names = unpack_sample(out / "sample", "test"), ("taau", "fusion-sr", str(weights))
-    with bars() as bar:
+    with Bars() as bar:
         evaluate(clips, names, out / "compared", Settings(4), progress=bar)
     print((out / "compared" / "metrics.md").read_text())
 

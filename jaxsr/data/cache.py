@@ -16,10 +16,10 @@ import hashlib
 import json
 import os
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, BinaryIO, NamedTuple
+from typing import BinaryIO, NamedTuple
 
 import numpy as np
 
@@ -27,9 +27,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_folder, read_json, remove_leftovers
 from jaxsr.io.sequence import Sequence
 from jaxsr.io.writing import LAYERS, frame_file
-
-Progress = Callable[[str, int], Callable[[], Any]]
-"""Called with a title and a number of steps; returns what is called after each step."""
+from jaxsr.progress import Progress, silent
 
 _VERSION = 1
 _WORKERS = 4
@@ -56,7 +54,7 @@ def open_arrays(
     resolutions: Iterable[str],
     *,
     cache: Path | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> dict[str, Arrays]:
     """Memory maps of a sequence, which is converted first where that was not done yet.
 
@@ -104,7 +102,7 @@ def _name(path: Path) -> str:
     return f"{path.name}-{hashlib.sha256(str(path).encode()).hexdigest()[:12]}"
 
 
-def _open(seq: Sequence, resolution: str, home: Path, progress: Progress | None) -> Arrays:
+def _open(seq: Sequence, resolution: str, home: Path, progress: Progress) -> Arrays:
     key = source_key(seq, resolution)
     folder = home / f"{resolution}-{key[:16]}"
     if not folder.is_dir():
@@ -124,8 +122,8 @@ def _map(path: Path) -> np.ndarray:
     return np.load(path, mmap_mode="r").view(np.ndarray)
 
 
-def _convert(seq: Sequence, resolution: str, key: str, folder: Path, progress: Progress | None) -> None:
-    advance = progress(f"convert {seq.path.name}", len(seq)) if progress is not None else lambda: None
+def _convert(seq: Sequence, resolution: str, key: str, folder: Path, progress: Progress) -> None:
+    advance = progress(f"convert {seq.path.name}", len(seq))
     fix = "make room, or choose another folder for the cache"
     with atomic_folder(folder, fix) as temporary, contextlib.ExitStack() as stack:
         files = {n: stack.enter_context(_LayerFile(temporary / f"{n}.npy", len(seq))) for n in LAYERS}

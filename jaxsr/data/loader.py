@@ -16,11 +16,12 @@ from typing import Any
 import grain
 
 from jaxsr.data.augment import random_crop
-from jaxsr.data.cache import Progress, source_key
+from jaxsr.data.cache import source_key
 from jaxsr.data.windows import WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.io.find import find_sequences
+from jaxsr.progress import Progress, silent
 
 _THREADS, _AHEAD = 2, 4
 
@@ -82,7 +83,7 @@ def make_loader(
     cache: Path | None = None,
     process_index: int = 0,
     process_count: int = 1,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> Loader:
     """Batches of random crops of windows of consecutive frames; the first call converts the sequences.
 

@@ -5,7 +5,6 @@ is unpacked to ordinary sequences where it is used. docs/data_card.md describes 
 """
 
 import importlib.resources
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_folder, remove_leftovers
 from jaxsr.io.archive import read_manifest, unpack_sequence
 from jaxsr.io.sequence import Sequence
+from jaxsr.progress import Progress, silent
 
 
 def sample_folder() -> Path:
@@ -38,7 +38,7 @@ def unpack_sample(
     split: str,
     scenes: tuple[str, ...] = (),
     scale: int | None = None,
-    progress: Callable[[str, int], Callable[[], Any]] = lambda title, total: lambda: None,
+    progress: Progress = silent,
 ) -> list[Path]:
     """Unpack the sequences of a split to `out/<name>`; what is there already is kept.
 
@@ -49,7 +49,7 @@ def unpack_sample(
         split: "test" or "train".
         scenes: names; all by default.
         scale: one that the sequences must have.
-        progress: called with a title and a number of steps; returns what is called after each step.
+        progress: told of each sequence.
 
     Returns:
         The folders, one a sequence.

@@ -14,11 +14,12 @@ from typing import Any
 import jax
 import numpy as np
 
-from jaxsr.data.cache import Arrays, Progress, open_arrays
+from jaxsr.data.cache import Arrays, open_arrays
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, Frame, GBuffer, Scale, Window
 from jaxsr.io.sequence import Sequence as Clip
 from jaxsr.io.writing import LAYERS
+from jaxsr.progress import Progress, silent
 
 _FIELDS = {"depth": "depth_linear", "motion": "motion_px"}
 NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in LAYERS if layer != "position")
@@ -55,7 +56,7 @@ class WindowSource:
         length: int = 1,
         held_back: int = 0,
         cache: Path | None = None,
-        progress: Progress | None = None,
+        progress: Progress = silent,
     ):
         unknown = sorted(needs - NEEDS)
         if unknown:

@@ -14,7 +14,7 @@ import dataclasses
 import math
 import re
 import tempfile
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,12 +25,10 @@ from jaxsr.evaluation.measuring import Meter, Truth
 from jaxsr.io.images import read_color, read_png, write_png
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.ops.color import to_display
+from jaxsr.progress import Advance, Progress, silent
 from jaxsr.report.page import write_report
 from jaxsr.report.results import MethodResult, SequenceResult
 from jaxsr.report.tables import write_metrics
-
-Progress = Callable[[str, int], Callable[[], Any]]
-"""Called with a title and a number of steps; gives what is called after each step."""
 
 _PLAIN = (".png", ".jpg", ".jpeg")
 _INNER = ("exr", "png")
@@ -177,7 +175,7 @@ def compare(
     meta: Mapping[str, Any] | None = None,
     max_megabytes: float = 18.0,
     keys: Collection[str] | None = None,
-    progress: Progress | None = None,
+    progress: Progress = silent,
 ) -> SequenceResult:
     """Measure folders of frames against the truth; write report.html, metrics.json, .csv and .md into `out`.
 
@@ -218,7 +216,7 @@ def compare(
         is_sequence = (truth / "sequence.json").is_file()
         exposure = FrameSequence.open(truth).exposure if is_sequence else 1.0
     starts = _starts(true)
-    advance = progress("measuring", len(found) * len(true.files)) if progress else lambda: None
+    advance = progress("measuring", len(found) * len(true.files))
     title = title or f"{' · '.join(names)} against {truth.resolve().name}"
     with _staging(out) as folder:
         shown = _Shown(folder, exposure)
@@ -298,7 +296,7 @@ def _measured(
     starts: Sequence[bool],
     shown: _Shown,
     meter: Meter,
-    advance: Callable[[], Any],
+    advance: Advance,
 ) -> MethodResult:
     """All metrics of a folder, two frames in memory at a time."""
     size: tuple[int, ...] | None = None

@@ -1,6 +1,6 @@
 """`jaxsr demo`: the sample that ships with the package, upscaled and extrapolated, measured and shown."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -9,6 +9,7 @@ import numpy as np
 from jaxsr.evaluation.measuring import Reference, metrics_with
 from jaxsr.evaluation.running import Settings, run_methods
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.progress import Progress
 from jaxsr.provenance import provenance
 from jaxsr.report.embedding import to_bytes
 from jaxsr.report.page import write_report
@@ -38,13 +39,13 @@ def run_demo(
     *,
     scale: int,
     lpips: bool = False,
-    progress: Callable[[str, int], Callable[[], Any]],
+    progress: Progress,
 ) -> list[SequenceResult]:
     """Run the demo and write frames, videos, metrics and the page into `out`.
 
     Args:
         lpips: measure LPIPS too, if its extra is installed; it takes longer than all the rest.
-        progress: called with a title and a number of steps; returns what is called after each step.
+        progress: told of each frame that is made and measured.
 
     Raises:
         JaxsrError: a sequence cannot be read or lacks the scale.

@@ -6,7 +6,7 @@ Writes `out/<sequence>/<method>/` (frames, error maps, results), and into `out` 
 
 import copy
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from jaxsr.evaluation.measuring import Reference
 from jaxsr.evaluation.running import Settings, run_methods
 from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.progress import Progress
 from jaxsr.report.page import write_report
 from jaxsr.report.results import SequenceResult
 from jaxsr.report.tables import write_metrics
@@ -91,7 +92,7 @@ def evaluate(
     frames: tuple[int, int] | None = None,
     title: str = "jaxsr evaluation",
     meta: Mapping[str, Any] | None = None,
-    progress: Callable[[str, int], Callable[[], Any]],
+    progress: Progress,
 ) -> list[SequenceResult]:
     """Run methods over sequences, measure them, and write frames, numbers and the page into `out`.
 
@@ -100,7 +101,7 @@ def evaluate(
         methods: names, or files of weights, as for `find_method`.
         frames: numbers of the first and the last frame; all by default.
         meta: shown on the page and kept with the numbers.
-        progress: called with a title and a number of steps; returns what is called after each step.
+        progress: told of each frame that is made and measured.
 
     Returns:
         A section a sequence; `rich_tables` prints them.

@@ -14,10 +14,11 @@ from typing import Any
 
 import jaxsr
 from jaxsr.evaluation.measuring import Reference
-from jaxsr.evaluation.running import Advance, Settings, check_folder, png_file, run_method
+from jaxsr.evaluation.running import Settings, check_folder, png_file, run_method
 from jaxsr.files import atomic_path, digest
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.metrics import available
+from jaxsr.progress import Advance
 from jaxsr.provenance import device, versions
 from jaxsr.report.results import MethodResult, Timing
 from jaxsr.report.tables import json_value

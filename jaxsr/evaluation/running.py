@@ -15,14 +15,12 @@ from jaxsr.evaluation.measuring import Meter, Reference, display
 from jaxsr.io.exr import write_exr
 from jaxsr.io.images import write_png
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.progress import Advance
 from jaxsr.report.results import MethodResult, SequenceResult, Timing
 from jaxsr.runtime.cost import Cost
 from jaxsr.runtime.load import LoadedMethod
 from jaxsr.runtime.schedule import check_needs, observed, rendered_schedule
 from jaxsr.runtime.stream import stream
-
-Advance = Callable[[], Any]
-"""Called once for every frame that is done."""
 
 TOGETHER = 4
 """Frames that are made before they are measured: threads measure them at once, and disturb no clock."""

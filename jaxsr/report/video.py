@@ -8,9 +8,8 @@ import contextlib
 import math
 import subprocess
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import imageio_ffmpeg
 import matplotlib
@@ -19,6 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path
+from jaxsr.progress import Advance
 from jaxsr.report.embedding import ImageOrPath, to_bytes
 
 TARGET_WIDTH = 1920
@@ -84,7 +84,7 @@ def write_video(
     *,
     per_row: int | None = None,
     captions: Sequence[str] | None = None,
-    advance: Callable[[], Any] = lambda: None,
+    advance: Advance = lambda: None,
 ) -> Path:
     """Write labelled columns of frames as one .mp4 (H.264, yuv420p, BT.709), atomically.
 

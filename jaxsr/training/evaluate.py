@@ -8,12 +8,12 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxsr.data.cache import Progress
 from jaxsr.data.windows import WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.methods import Method
 from jaxsr.metrics import psnr, ssim
 from jaxsr.ops import to_display
+from jaxsr.progress import Progress, silent
 
 FRAMES = 8
 """Frames that are measured, at most, evenly over all."""
@@ -60,7 +60,7 @@ class Evaluator:
         window: int = 1,
         held_back: int = 0,
         cache: Path | None = None,
-        progress: Progress | None = None,
+        progress: Progress = silent,
     ):
         self._source = WindowSource(
             sequences, scale=scale, needs=needs, length=window, cache=cache, progress=progress

@@ -32,11 +32,11 @@ from jaxsr.io.sequence import Sequence, prefetch
 from jaxsr.methods import Method
 from jaxsr.methods.base import Net
 from jaxsr.nets import vgg as perceptual
-from jaxsr.progress import bars
+from jaxsr.progress import Bars
 from jaxsr.training.checkpoints import FOLDER, Checkpoints, has_checkpoints
 from jaxsr.training.config import TrainConfig, describe, enter, identity
 from jaxsr.training.evaluate import Evaluator
-from jaxsr.training.record import Bar, Log
+from jaxsr.training.record import Log
 from jaxsr.training.state import begin, inference_net, schedule
 from jaxsr.training.step import make_step, shardings
 from jaxsr.weights.file import into, load_weights, save_weights
@@ -105,7 +105,7 @@ def train(
 
         log = Log(config.out, start)
         stack.callback(log.close)
-        bar = stack.enter_context(Bar(start, config.steps, quiet=quiet))
+        bar = stack.enter_context(Bars(quiet=quiet)).start("steps", config.steps, start)
         stop = stack.enter_context(_first_interrupt())
         count = sum(math.prod(p.shape) for p in jax.tree.leaves(state.params))
         bar.say(
@@ -147,7 +147,7 @@ def train(
             settle = to_evaluate or to_save or step == start + 1
             while len(waiting) > (0 if settle else 1):
                 rows.append(_looked_at(*waiting.pop(0), checkpoints.latest))
-                bar.update(int(rows[-1]["step"]), rows[-1]["loss"])
+                bar.update(int(rows[-1]["step"]), f"loss {rows[-1]['loss']:.4f}")
             if step == start + 1:
                 bar.say(f"step {step}: loss {rows[-1]['loss']:.4f}, took {time.monotonic() - clock:.2f} s")
             run["seconds"] = seconds + time.monotonic() - began
@@ -214,9 +214,7 @@ def _sample(config: TrainConfig, quiet: bool) -> list[Path]:
     archives = [path.read_bytes() for path in sorted(sample_folder().glob("*.jsrz.sha256"))]
     name = f"sample-{hashlib.sha256(b''.join(archives)).hexdigest()[:12]}"  # another release has another
     folder = (config.cache or default_cache().parent) / name
-    if quiet:
-        return unpack_sample(folder, "train", scale=config.scale)
-    with bars() as progress:
+    with Bars(quiet=quiet) as progress:
         return unpack_sample(folder, "train", scale=config.scale, progress=progress)
 
 
@@ -245,7 +243,7 @@ def _data(method: Method, config: TrainConfig, quiet: bool) -> tuple[Loader, Eva
                 if fits
                 else "bring longer ones with --data",
             )
-    with contextlib.nullcontext() if quiet else bars() as progress:
+    with Bars(quiet=quiet) as progress:
         shared: Any = {"scale": config.scale, "held_back": held_back, "cache": config.cache}
         shared |= {"needs": method.needs, "window": method.window, "progress": progress}
         evaluate = Evaluator(method, evaluated, **shared)

@@ -1,4 +1,4 @@
-"""What a training leaves to look at: `log.csv`, TensorBoard, pictures, the loss curve, and the bar on screen.
+"""What a training leaves to look at: `log.csv`, TensorBoard, pictures and the loss curve.
 
 All of it begins again where a resumed training does: rows and events past its checkpoint are dropped.
 """
@@ -6,9 +6,7 @@ All of it begins again where a resumed training does: rows and events past its c
 import contextlib
 import csv
 import io
-import math
 import os
-import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -174,76 +172,3 @@ def _smooth(values: np.ndarray) -> np.ndarray:
     total = np.concatenate([[0.0], np.cumsum(values)])
     low, high = np.maximum(np.arange(n) - half, 0), np.minimum(np.arange(n) + half + 1, n)
     return (total[high] - total[low]) / (high - low)
-
-
-class Bar:
-    """The bar on stderr: loss, rate and remaining time; where that is no terminal, a line now and then.
-
-    Use it in a `with` block.
-
-    Args:
-        done, total: steps.
-        quiet: show nothing.
-    """
-
-    LINE_SECONDS = 30.0
-
-    def __init__(self, done: int, total: int, *, quiet: bool = False):
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-        self._console = Console(stderr=True, quiet=quiet, soft_wrap=True, highlight=False)
-        self._total, self._left_of = total, done
-        self._rates: list[tuple[float, int]] = []
-        self.rate = "-"
-        self._printed = time.monotonic()
-        columns = (
-            TextColumn("steps"),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TextColumn("loss {task.fields[loss]}", style="bold"),
-            TextColumn("{task.fields[rate]}", style="cyan"),
-            TimeElapsedColumn(),
-            TextColumn("left {task.fields[left]}"),
-        )
-        self._progress = Progress(*columns, console=self._console)
-        self._task = self._progress.add_task("", total=total, completed=done, loss="-", rate="-", left="-")
-
-    def __enter__(self) -> "Bar":
-        if self._console.is_terminal:
-            self._progress.start()
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        if self._console.is_terminal:
-            self._progress.stop()
-
-    def say(self, text: str) -> None:
-        """A line above the bar."""
-        self._printed = time.monotonic()
-        self._console.print(text, markup=False)
-        sys.stderr.flush()
-
-    def update(self, step: int, loss: float) -> None:
-        """A step was done."""
-        now = time.monotonic()
-        self._rates = [*self._rates[-29:], (now, step)]
-        (then, first) = self._rates[0]
-        speed = (step - first) / (now - then) if now > then else math.nan
-        self.rate = (
-            "-" if not speed > 0 else f"{speed:.2f} steps/s" if speed >= 1 else f"{1 / speed:.2f} s/step"
-        )
-        left = "-" if not speed > 0 else _clock((self._total - step) / speed)
-        self._progress.update(self._task, completed=step, loss=f"{loss:.4f}", rate=self.rate, left=left)
-        if not self._console.is_terminal and now - self._printed > self.LINE_SECONDS:
-            self.say(f"step {step}/{self._total}: loss {loss:.4f}, {self.rate}, {left} left")
-
-    def pause(self) -> None:
-        """What comes now does not count towards the rate."""
-        self._rates = []
-
-
-def _clock(seconds: float) -> str:
-    minutes, s = divmod(round(seconds), 60)
-    hours, m = divmod(minutes, 60)
-    return f"{hours}:{m:02d}:{s:02d}"

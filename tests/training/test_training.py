@@ -21,10 +21,11 @@ from jaxsr.data.loader import make_loader
 from jaxsr.errors import JaxsrError
 from jaxsr.io.images import read_png
 from jaxsr.methods import build, fusion_sr
+from jaxsr.progress import Bar
 from jaxsr.training import TrainConfig, loop
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
-from jaxsr.training.record import Bar, Log, plot_curve
+from jaxsr.training.record import Log, plot_curve
 from jaxsr.training.state import begin, optimizer, schedule
 from jaxsr.training.step import averaged, make_step, shardings
 from jaxsr.weights.file import load_weights
@@ -115,10 +116,10 @@ def test_interrupt_saves_and_goes_on(whole, data, tmp_path, monkeypatch, capfd):
     """The step ends, a checkpoint is written, and the rest is as if nothing had happened."""
     update = Bar.update
 
-    def interrupting(self, step, loss):
+    def interrupting(self, step, note):
         if step == 5:
             os.kill(os.getpid(), signal.SIGINT)
-        update(self, step, loss)
+        update(self, step, note)
 
     out, before = tmp_path / "out", signal.getsignal(signal.SIGINT)
     monkeypatch.setattr(Bar, "update", interrupting)
@@ -530,16 +531,6 @@ def test_a_killed_log_loses_no_row(tmp_path):
 def test_curve(tmp_path, count):
     plot_curve(tmp_path / "loss.png", [{"step": k, "loss": 1.0 / (k + 1)} for k in range(count)])
     assert read_png(tmp_path / "loss.png").shape[-1] == 3
-
-
-def test_bar_without_a_terminal(capsys, monkeypatch):
-    monkeypatch.setattr(Bar, "LINE_SECONDS", 0.0)
-    with Bar(0, 10) as bar:
-        bar.update(1, 0.5)
-        bar.update(2, 0.25)
-    lines = capsys.readouterr().err.splitlines()
-    assert lines[0].startswith("step 1/10: loss 0.5000")
-    assert "left" in lines[1]
 
 
 def test_checkpoint_holds_random_keys(tmp_path):
