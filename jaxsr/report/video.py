@@ -142,6 +142,8 @@ def write_video(
             *("-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "bt709"),
             *("-movflags", "+faststart", "-f", "mp4", str(temporary)),
         ]
+        # Not imageio_ffmpeg.write_frames: it ignores ffmpeg's status, so that a full disk looks like success,
+        # and ffmpeg's messages go to the terminal.
         process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=log)
         assert process.stdin is not None
         try:
