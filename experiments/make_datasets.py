@@ -19,8 +19,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -31,16 +30,6 @@ sys.path.insert(0, str(ROOT))
 
 import numpy as np  # noqa: E402
 import tyro  # noqa: E402
-from rich.console import Console  # noqa: E402
-from rich.progress import (  # noqa: E402
-    BarColumn,
-    Progress,
-    ProgressColumn,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from experiments import dataset_card  # noqa: E402
 from jaxsr.blender import render as blender  # noqa: E402
@@ -52,6 +41,7 @@ from jaxsr.io.archive import pack, read_manifest, unpack_sequence, verify  # noq
 from jaxsr.io.exr import read_exr  # noqa: E402
 from jaxsr.io.sequence import Sequence  # noqa: E402
 from jaxsr.ops.color import to_display  # noqa: E402
+from jaxsr.progress import Bar, Bars  # noqa: E402
 from jaxsr.provenance import commit, machine  # noqa: E402
 
 SCENES = ("bunker", "forest", "docks")
@@ -163,23 +153,6 @@ class OutOfTime(Exception):
     """The budget is spent; what is finished stays."""
 
 
-class _Rate(ProgressColumn):
-    def render(self, task: Any) -> str:  # type: ignore[override]
-        return f"{60 * task.speed:.2f} frames/min" if task.speed else "- frames/min"
-
-
-@contextmanager
-def bar(console: Console, total: float, what: str) -> Iterator[tuple[Progress, TaskID]]:
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        TextColumn("{task.completed:.1f}/{task.total:.0f}"),
-    )
-    times = (_Rate(), TimeElapsedColumn(), TimeRemainingColumn())
-    with Progress(*columns, *times, console=console, speed_estimate_period=600) as progress:
-        yield progress, progress.add_task(what, total=total)
-
-
 def is_complete(folder: Path, clip: Clip, config: Render) -> bool:
     """Whether all frames are there, as the configuration asks for them."""
     if not (folder / "sequence.json").is_file():
@@ -235,37 +208,33 @@ def check_scenes(scenes: tuple[str, ...]) -> None:
             raise JaxsrError("no such scene", where="--scenes", expected=", ".join(SCENES), found=scene)
 
 
-def render_set(config: Render, console: Console) -> None:
+def render_set(config: Render, bars: Bars) -> None:
     """The verb `render`."""
     check_scenes(config.scenes)
     clips, base = clips_of(config), config.out / config.set
     deadline = time.monotonic() + 60 * config.budget_minutes
-    with bar(console, sum(c.frames for c in clips), config.set) as (progress, task):
-        finished = 0.0
-        try:
-            for clip in clips:
-                progress.update(task, description=f"{config.set} {clip.name}")
-                if not is_complete(base / clip.name, clip, config) and not from_archive(
-                    config, clip, base / clip.name
-                ):
-                    _render_clip(config, clip, base / clip.name, deadline, progress, task, finished)
-                finished += clip.frames
-                progress.update(task, completed=finished)
-        except OutOfTime:
-            console.print(f"budget of {config.budget_minutes:g} minutes spent; run again to go on")
+    bar = bars.start(config.set, sum(c.frames for c in clips), unit="frame")
+    finished = 0.0
+    try:
+        for clip in clips:
+            bar.update(finished, clip.name)
+            if not is_complete(base / clip.name, clip, config) and not from_archive(
+                config, clip, base / clip.name
+            ):
+                _render_clip(config, clip, base / clip.name, deadline, bar)
+            finished += clip.frames
+            bar.update(finished)
+    except OutOfTime:
+        bars.say(f"budget of {config.budget_minutes:g} minutes spent; run again to go on")
 
 
-def _render_clip(
-    config: Render, clip: Clip, folder: Path, deadline: float, progress: Progress, task: TaskID, before: float
-) -> None:
-    start, last = time.monotonic(), 0.0
+def _render_clip(config: Render, clip: Clip, folder: Path, deadline: float, bar: Bar) -> None:
+    start, last, before = time.monotonic(), 0.0, bar.done
 
     def report(p: blender.Progress) -> None:
         nonlocal last
         last = p.cpu_seconds
-        progress.update(
-            task, completed=before + p.done_frames, description=f"{config.set} {clip.name} {p.message}"
-        )
+        bar.update(before + p.done_frames, f"{clip.name} {p.message}")
         if time.monotonic() > deadline:
             raise OutOfTime
 
@@ -344,42 +313,42 @@ def _colors(
     return {f: convert_color(read_exr(path)[0]) for f, path in files.items()}, described
 
 
-def measure_floor(config: Floor, console: Console) -> None:
+def measure_floor(config: Floor, bars: Bars) -> None:
     """The verb `floor`: one entry a scene, split and clip in the results, replaced when measured again."""
     check_scenes(config.scenes)
     clips = [Clip(s, split, c, 12) for s in config.scenes for split in config.splits for c in config.clips]
-    with bar(console, 2 * len(clips) * len(config.frames), "floor") as (progress, task):
-        for clip in clips:
-            progress.update(task, description=f"floor {clip.name}")
-            images = []
-            start = time.monotonic()
-            for seed in config.seeds:
-                with tempfile.TemporaryDirectory() as folder:
-                    images.append(_colors(config, clip, seed, Path(folder), lambda: progress.advance(task)))
-            (a, described), (b, _) = images
-            by_frame = {f: round(floor_psnr(a[f], b[f], described["exposure"]), 2) for f in config.frames}
-            mean_square = np.mean([10 ** (-psnr / 10) for psnr in by_frame.values()])
-            entry = {
-                "psnr_db": round(float(-10 * np.log10(mean_square)), 2),
-                "frames": by_frame,
-                "size": config.size,
-                **{key: described[key] for key in ("samples", "denoise", "bounces", "exposure", "blender")},
-                "scene_sha256": described["scene_sha256"],
-                "seeds": config.seeds,
-                "commit": commit(),
-                "device": machine(),
-                "seconds": round(time.monotonic() - start, 1),
-                "time": datetime.now(UTC).isoformat(timespec="seconds"),
-            }
-            old = json.loads(config.results.read_text()) if config.results.is_file() else {}
-            write_json(config.results, dict(sorted((old | {clip.name: entry}).items())))
-            console.print(f"{clip.name}: {entry['psnr_db']} dB at {entry['samples']} samples")
+    bar = bars.start("floor", 2 * len(clips) * len(config.frames), unit="frame")
+    for clip in clips:
+        bar.update(bar.done, clip.name)
+        images = []
+        start = time.monotonic()
+        for seed in config.seeds:
+            with tempfile.TemporaryDirectory() as folder:
+                images.append(_colors(config, clip, seed, Path(folder), bar.advance))
+        (a, described), (b, _) = images
+        by_frame = {f: round(floor_psnr(a[f], b[f], described["exposure"]), 2) for f in config.frames}
+        mean_square = np.mean([10 ** (-psnr / 10) for psnr in by_frame.values()])
+        entry = {
+            "psnr_db": round(float(-10 * np.log10(mean_square)), 2),
+            "frames": by_frame,
+            "size": config.size,
+            **{key: described[key] for key in ("samples", "denoise", "bounces", "exposure", "blender")},
+            "scene_sha256": described["scene_sha256"],
+            "seeds": config.seeds,
+            "commit": commit(),
+            "device": machine(),
+            "seconds": round(time.monotonic() - start, 1),
+            "time": datetime.now(UTC).isoformat(timespec="seconds"),
+        }
+        old = json.loads(config.results.read_text()) if config.results.is_file() else {}
+        write_json(config.results, dict(sorted((old | {clip.name: entry}).items())))
+        bars.say(f"{clip.name}: {entry['psnr_db']} dB at {entry['samples']} samples")
 
 
 # --- archive ---------------------------------------------------------------------------------------------
 
 
-def pack_set(config: Pack, console: Console) -> None:
+def pack_set(config: Pack, bars: Bars) -> None:
     """The verb `pack`. Names in the archive are the paths below `dir`, with the set in front."""
     folders = sorted(
         p.parent
@@ -399,18 +368,18 @@ def pack_set(config: Pack, console: Console) -> None:
     for folder in folders:
         seq = Sequence.open(folder)
         members += len(seq) * len(seq.resolutions)
-    with bar(console, members, "pack") as (progress, task):
-        digest = pack(
-            names,
-            config.archive,
-            config.color_bits,
-            config.max_megabytes,
-            lambda name, size: progress.update(task, advance=1, description=f"pack {name}"),
-        )
-    console.print(f"{config.archive}: {config.archive.stat().st_size / 1e6:.1f} MB, sha256 {digest}")
+    bar = bars.start("pack", members, unit="image")
+    digest = pack(
+        names,
+        config.archive,
+        config.color_bits,
+        config.max_megabytes,
+        lambda name, size: bar.update(bar.done + 1, name),
+    )
+    bars.say(f"{config.archive}: {config.archive.stat().st_size / 1e6:.1f} MB, sha256 {digest}")
 
 
-def unpack_set(config: Unpack, console: Console) -> None:
+def unpack_set(config: Unpack, bars: Bars) -> None:
     """The verb `unpack`."""
     archives = [config.archive] if config.archive else find_archives(config.search)
     if not archives:
@@ -418,14 +387,13 @@ def unpack_set(config: Unpack, console: Console) -> None:
     for archive in archives:
         manifest = read_manifest(archive)
         verify(archive)
-        with bar(console, len(manifest["sequences"]), "unpack") as (progress, task):
-            for name in manifest["sequences"]:
-                unpack_sequence(archive, manifest, name, config.out / name)
-                progress.update(task, advance=1, description=f"unpack {name}")
+        bar = bars.start("unpack", len(manifest["sequences"]), unit="sequence")
+        for name in manifest["sequences"]:
+            unpack_sequence(archive, manifest, name, config.out / name)
+            bar.update(bar.done + 1, name)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    console = Console(stderr=True)
     command = tyro.conf.subcommand
     config: Any = tyro.cli(
         Annotated[Render, command("render")]  # type: ignore[arg-type]
@@ -437,21 +405,22 @@ def main(arguments: list[str] | None = None) -> int:
         config=(tyro.conf.OmitArgPrefixes,),
     )
     try:
-        if isinstance(config, Render):
-            render_set(replace(config, out=config.out.expanduser()), console)
-        elif isinstance(config, Floor):
-            measure_floor(config, console)
-        elif isinstance(config, Card):
-            print(dataset_card.write(**asdict(config)))
-        elif isinstance(config, Pack):
-            pack_set(config, console)
-        else:
-            unpack_set(config, console)
+        with Bars() as bars:
+            if isinstance(config, Render):
+                render_set(replace(config, out=config.out.expanduser()), bars)
+            elif isinstance(config, Floor):
+                measure_floor(config, bars)
+            elif isinstance(config, Card):
+                print(dataset_card.write(**asdict(config)))
+            elif isinstance(config, Pack):
+                pack_set(config, bars)
+            else:
+                unpack_set(config, bars)
     except JaxsrError as e:
-        console.print(f"error: {e}", style="red", markup=False, highlight=False, soft_wrap=True)
+        print(f"error: {e}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        console.print("stopped; run again to go on")
+        print("stopped; run again to go on", file=sys.stderr)
         return 130
     return 0
 

@@ -84,7 +84,7 @@ class Bar:
     """
 
     def __init__(self, bars: Bars, title: str, total: float | None, done: float, unit: str):
-        self.done, self.rate = done, "-"
+        self.done, self.rate, self._note = done, "-", ""
         self._bars, self._title, self._total, self._unit = bars, title, total, unit
         self._times: list[tuple[float, float]] = []
         self._task = bars._progress.add_task(
@@ -95,15 +95,16 @@ class Bar:
         """One more unit is done."""
         self.update(self.done + 1)
 
-    def update(self, done: float, note: str = "", total: float | None = None) -> None:
+    def update(self, done: float, note: str | None = None, total: float | None = None) -> None:
         """So many units are done.
 
         Args:
             done: of all, those of earlier runs included.
-            note: a few words beside the bar.
+            note: a few words beside the bar; None keeps the last ones.
             total: where it is known only now.
         """
         now, self.done = time.monotonic(), done
+        self._note = self._note if note is None else note
         self._total = self._total if total is None else total
         self._times = [*self._times[-29:], (now, done)]
         then, first = self._times[0]
@@ -118,13 +119,15 @@ class Bar:
             total=self._total,
             completed=done,
             count=self._count(),
-            note=note,
+            note=self._note,
             rate=self.rate,
             left=left,
         )
         bars = self._bars
         if not bars._console.is_terminal and now - bars._printed > bars.LINE_SECONDS:
-            bars.say(f"{self._title} {self._count()}: {f'{note}, ' if note else ''}{self.rate}, {left} left")
+            bars.say(
+                f"{self._title} {self._count()}: {f'{self._note}, ' if self._note else ''}{self.rate}, {left} left"
+            )
 
     def pause(self) -> None:
         """What comes now does not count towards the rate."""

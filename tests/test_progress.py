@@ -24,12 +24,17 @@ def test_lines_now_and_then_where_there_is_no_terminal(capsys, clock):
         for _ in range(8):
             clock[0] += 10
             advance()
+        bar = bars.start("steps", 3)
+        bar.update(0, "loss 0.5")
+        clock[0] += 31
+        bar.advance()
         bars.say("a [line] above")
     out, err = capsys.readouterr()
     assert out == ""
     assert err.splitlines() == [
         "frames 4/10: 10.00 s/step, 0:01:00 left",
         "frames 8/10: 10.00 s/step, 0:00:20 left",
+        "steps 1/3: loss 0.5, 31.00 s/step, 0:01:02 left",
         "a [line] above",
     ]
 

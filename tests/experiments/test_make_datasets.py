@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from rich.console import Console
 
 from experiments import make_datasets as md
 from jaxsr.errors import JaxsrError
@@ -18,6 +17,7 @@ from jaxsr.io.archive_coding import decode_plane, encode_plane, quantise_normal,
 from jaxsr.io.exr import read_exr
 from jaxsr.io.sequence import Sequence, SequenceWriter
 from jaxsr.io.writing import FrameInfo
+from jaxsr.progress import Bars
 
 SIZE = (16, 8)
 
@@ -259,10 +259,6 @@ def test_sets_share_no_clip_and_interleave_scenes():
     assert [(c.name, c.frames) for c in few] == [("forest-train-0", 3), ("forest-train-1", 3)]
 
 
-def quiet() -> Console:
-    return Console(quiet=True)
-
-
 def test_render_takes_what_an_archive_has_and_needs_no_blender(packed, tmp_path, monkeypatch):
     _, file = packed
     monkeypatch.setenv("JAXSR_BLENDER", "nowhere")
@@ -271,13 +267,13 @@ def test_render_takes_what_an_archive_has_and_needs_no_blender(packed, tmp_path,
         set="train", scenes=("bunker",), clips=1, frames=3, size=SIZE, scales=(2,), out=tmp_path / "out"
     )
     with pytest.raises(JaxsrError, match="JAXSR_BLENDER"):
-        md.render_set(config, quiet())
+        md.render_set(config, Bars(quiet=True))
     monkeypatch.setattr(md, "SHARED", file.parent)
-    md.render_set(config, quiet())
+    md.render_set(config, Bars(quiet=True))
     seq = Sequence.open(tmp_path / "out" / "train" / "bunker-train-0")
     assert len(seq) == 3
     monkeypatch.setattr(md, "SHARED", tmp_path / "no shared folder")
-    md.render_set(config, quiet())  # complete: nothing to do
+    md.render_set(config, Bars(quiet=True))  # complete: nothing to do
 
 
 def test_another_seed_is_neither_complete_nor_taken_from_an_archive(packed, tmp_path, monkeypatch):
@@ -324,7 +320,7 @@ def test_a_failed_floor_keeps_the_log_that_it_names(tmp_path, monkeypatch, capsy
 def test_budget_ends_before_the_next_clip(tmp_path, monkeypatch):
     monkeypatch.setattr(md, "SHARED", tmp_path)
     config = md.Render(set="test", budget_minutes=0.0, out=tmp_path / "out")
-    md.render_set(config, quiet())
+    md.render_set(config, Bars(quiet=True))
     assert not list(tmp_path.rglob("*.exr"))
 
 
