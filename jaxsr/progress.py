@@ -125,9 +125,8 @@ class Bar:
         )
         bars = self._bars
         if not bars._console.is_terminal and now - bars._printed > bars.LINE_SECONDS:
-            bars.say(
-                f"{self._title} {self._count()}: {f'{self._note}, ' if self._note else ''}{self.rate}, {left} left"
-            )
+            words = [self._note, self.rate, f"{left} left"]
+            bars.say(f"{self._title} {self._count()}: {', '.join(filter(None, words))}")
 
     def pause(self) -> None:
         """What comes now does not count towards the rate."""
