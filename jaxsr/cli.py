@@ -317,8 +317,8 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 and one line on bad input."""
     given = sys.argv[1:] if arguments is None else arguments
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # what a stream cannot show becomes "?", and no error
-            stream.reconfigure(errors="replace")
+        if isinstance(stream, io.TextIOWrapper):  # a sign that a stream cannot show is no error
+            stream.reconfigure(errors="backslashreplace")
     try:
         if given[:1] == ["train"]:
             from jaxsr.training.command import run

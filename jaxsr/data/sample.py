@@ -1,7 +1,7 @@
 """The rendered sample that ships with the package: three scenes, a test and a training clip of each.
 
-It travels as one archive a scene (`jaxsr.io.archive`), since OpenEXR would take several times the space, and
-is unpacked to ordinary sequences where it is used. docs/data_card.md describes it.
+It is stored as one archive per scene (`jaxsr.io.archive`), since OpenEXR would take several times the space,
+and is unpacked to ordinary sequences where it is used. docs/data_card.md describes it.
 """
 
 import importlib.resources
@@ -52,7 +52,7 @@ def unpack_sample(
         progress: told of each sequence.
 
     Returns:
-        The folders, one a sequence.
+        The folders, one per sequence.
 
     Raises:
         JaxsrError: no such scene, split or scale, no sample, a damaged archive, or no room.

@@ -1,6 +1,6 @@
 """What a training leaves to look at: `log.csv`, TensorBoard, pictures and the loss curve.
 
-All of it begins again where a resumed training does: rows and events past its checkpoint are dropped.
+When a training resumes from a checkpoint, rows and events of later steps are dropped.
 """
 
 import contextlib
@@ -16,19 +16,25 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path
+from jaxsr.files import atomic_path, read_bytes, write_text
 from jaxsr.io.images import write_png
+
+LOG_BYTES = 256 << 20
+"""Largest log that is read."""
 
 
 class Log:
-    """Rows of numbers by step, as CSV with an empty field where a row has no such number, and in TensorBoard.
+    """One row of numbers per step that is logged, in `log.csv` and in TensorBoard.
+
+    A field of the CSV is empty where its row has no such number.
 
     Args:
         out: folder of the training.
-        step: of the checkpoint that it goes on from; later rows are dropped.
+        step: the step of the checkpoint from which the training resumes; 0 for a new one. Rows of later steps
+            are dropped.
 
     Raises:
-        JaxsrError: log.csv is no such file.
+        JaxsrError: log.csv is not a log of a training.
     """
 
     def __init__(self, out: Path, step: int):
@@ -39,14 +45,14 @@ class Log:
         self._board = _Board(out / "tensorboard", step)
 
     def add(self, row: dict[str, float]) -> None:
-        """One more row; "step" is among its numbers."""
+        """Add a row; "step" must be among its numbers."""
         self.rows.append(row)
         new = [name for name in row if name not in self._columns]
         self._columns += new
         if new:
             self._rewrite()
         else:
-            with _told(self._file), self._file.open("a", encoding="utf-8", newline="") as file:
+            with _write_errors(self._file), self._file.open("a", encoding="utf-8", newline="") as file:
                 self._writer(file).writerow(row)
         self._board.scalars({name: value for name, value in row.items() if name != "step"}, int(row["step"]))
 
@@ -60,7 +66,7 @@ class Log:
         plot_curve(self._out / "loss.png", self.rows)
 
     def flush(self) -> None:
-        """See that TensorBoard's file holds what was added."""
+        """Write what was added so far to TensorBoard's file."""
         self._board.flush()
 
     def close(self) -> None:
@@ -76,26 +82,29 @@ class Log:
         if self._columns:
             writer.writeheader()
         writer.writerows(self.rows)
-        with atomic_path(self._file) as temporary:
-            temporary.write_text(text.getvalue(), encoding="utf-8")
+        write_text(self._file, text.getvalue())
 
 
 class _Board:
-    """TensorBoard's file. tensorboardX's own writer is a thread: a full disk ends it, and we wait forever."""
+    """TensorBoard's file, written in this thread.
+
+    tensorboardX has a writer with a thread of its own; a full disk ends that thread, and `close` then waits
+    for it forever.
+    """
 
     def __init__(self, folder: Path, step: int):
         from tensorboardX.event_file_writer import EventsWriter
         from tensorboardX.proto import event_pb2
 
         self._folder, self._event = folder, event_pb2.Event
-        with _told(folder):
+        with _write_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
             self._file = EventsWriter(str(folder / "events"), f".{os.getpid()}-{step}")
-        if step:  # drops what other files say of later steps
+        if step:  # TensorBoard drops what earlier files say of later steps
             self._add(step + 1, session_log=event_pb2.SessionLog(status=event_pb2.SessionLog.START))
 
     def _add(self, step: int, **content: Any) -> None:
-        with _told(self._folder):
+        with _write_errors(self._folder):
             self._file.write_event(self._event(step=step, wall_time=time.time(), **content))
 
     def scalars(self, values: dict[str, float], step: int) -> None:
@@ -110,16 +119,16 @@ class _Board:
         self._add(step, summary=summary(name, image, dataformats="HWC"))
 
     def flush(self) -> None:
-        with _told(self._folder):
+        with _write_errors(self._folder):
             self._file.flush()
 
     def close(self) -> None:
-        with contextlib.suppress(OSError):  # `flush` would have said so
+        with contextlib.suppress(OSError):  # `flush` has reported it
             self._file.close()
 
 
 @contextlib.contextmanager
-def _told(where: Path) -> Iterator[None]:
+def _write_errors(where: Path) -> Iterator[None]:
     try:
         yield
     except OSError as e:
@@ -130,11 +139,11 @@ def _read(file: Path) -> list[dict[str, float]]:
     if not file.is_file():
         return []
     try:
-        # A killed writer may have left a part of the last line.
-        whole = file.read_text(encoding="utf-8").rpartition("\n")[0]
+        # A writer that was killed may have left a part of the last line.
+        whole = read_bytes(file, LOG_BYTES).decode().rpartition("\n")[0]
         rows = [{k: float(v) for k, v in row.items() if v} for row in csv.DictReader(whole.splitlines())]
         return [row | {"step": int(row["step"])} for row in rows]
-    except (ValueError, TypeError, KeyError, AttributeError) as e:
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, csv.Error) as e:
         raise JaxsrError("not the log of a training", where=file, found=e, fix="delete it") from e
 
 
