@@ -16,16 +16,17 @@ or logarithm, sky is +inf). Demodulation, masks and blending are left to the cal
 """
 
 import functools
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Literal, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jaxsr.errors import JaxsrError
+from jaxsr.ops._batch import over_batch
 
 DEFAULT_SIGMA_GUIDE = 0.15
 """Standard deviation of guide differences: base colour, unit normals (experiments/tune_classical.py)."""
@@ -37,6 +38,10 @@ _CLIP = 1e12  # scaled guides stay below; the squares of their differences ...
 _NOWHERE = 1e28  # ... stay far below this, ...
 _FAR = 1e15  # ... and those to what is not there lie far above, and are finite
 _NORMAL = 1e-12  # keeps keys out of the denormal numbers, which some processors flush to 0
+
+T = TypeVar("T")
+Batching = Literal["map", "vmap"]
+Fence = Literal["cond", "barrier", "none"]
 
 
 @functools.partial(jax.jit, static_argnames=("strides", "radius", "count"))
@@ -88,25 +93,71 @@ def reproject(
         JaxsrError: sizes, channels, sigmas, strides, radius or count that make no sense.
     """
     _check(previous, motion_px, guide, previous_guide, jnp.shape(sigma_guide), strides, radius, count)
-    offsets = candidate_offsets(strides, radius)
-    scale = jnp.broadcast_to(_inverse_sigma(sigma_guide), guide.shape[-1:])
-    scale_space = _inverse_sigma(sigma_space)
+    return _reproject(
+        (previous, motion_px, guide, previous_guide),
+        (sigma_guide, sigma_space),
+        candidate_offsets(strides, radius),
+        count,
+        batching="map" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "vmap",
+        fence="cond" if jax.default_backend() == "cpu" else "none",
+    )
 
-    # Always true, which the compiler cannot know: behind a condition it computes things once, where it would
-    # otherwise copy them into each of their readers. Taken here, so that it has no batch axis.
-    true = ~(jnp.minimum(motion_px[(0,) * motion_px.ndim], 1) > 2)
+
+def _reproject(
+    arrays: tuple[Array, Array, Array, Array],
+    sigmas: tuple[Array | float, Array | float],
+    offsets: Int[np.ndarray, "n 2"],
+    count: int,
+    *,
+    batching: Batching,
+    fence: Fence,
+) -> tuple[Array, Array]:
+    """`reproject` in one of several forms of equal results; `benchmarks/reproject.py` times them.
+
+    Args:
+        arrays: previous values, motion, guide, previous guide.
+        sigmas: of the guide, of the distance.
+        offsets: of the candidates.
+        count: how many candidates are kept.
+        batching: "map" takes one image after the other, which on a CPU needs a tenth of the memory and half
+            the time. On several devices it would gather a batch that is sharded over them; "vmap" keeps the
+            sharding.
+        fence: see `_fenced`.
+    """
+    dtype = functools.reduce(np.promote_types, (a.dtype for a in arrays[1:]), np.dtype(np.float32))
+    scale = jnp.broadcast_to(_inverse_sigma(sigmas[0], dtype), arrays[2].shape[-1:])
+    scale_space = _inverse_sigma(sigmas[1], dtype)
+    count = min(count, len(offsets))
 
     def one(value: Array, motion: Array, g: Array, g_prev: Array) -> tuple[Array, Array]:
         there = _padded(g_prev, scale, pad=2 * int(np.abs(offsets).max()) + 1)
-        near = _Neighbourhood(motion, g, there, scale, scale_space, true)
-        kept = _select(jax.lax.stop_gradient(near), offsets, min(count, len(offsets)))
-        return _filter(value, near, kept, offsets, min(count, len(offsets)))
+        near = _Neighbourhood(motion, g, there, scale, scale_space)
+        words = _fenced(lambda: _select(jax.lax.stop_gradient(near), offsets, count), fence)
+        distance = _fenced(lambda: _distances(near, words, offsets, count), fence)
+        return _filter(value, near, words, distance, offsets)
 
-    # One image after the other: under vmap the gathers' indices are stored, and it takes twice as long.
+    if batching == "vmap":
+        return over_batch(one, *arrays)
+
     def images(*arrays: Array) -> tuple[Array, Array]:
         return one(*arrays) if arrays[0].ndim == 3 else jax.lax.map(lambda xs: images(*xs), arrays)
 
-    return images(previous, motion_px, guide, previous_guide)
+    return images(*arrays)
+
+
+def _fenced(compute: Callable[[], T], fence: Fence) -> T:
+    """The result of `compute`, which XLA must not copy into each of its readers.
+
+    On a CPU such copies take five times as long. A conditional boundary stops XLA from making them: "cond" is
+    a condition on an opaque True, a constant that XLA cannot see through. "barrier" is an optimisation
+    barrier. "none" trusts the compiler: on a GPU a condition may cost a round trip to the host.
+    """
+    if fence == "none":
+        return compute()
+    if fence == "barrier":
+        return jax.lax.optimization_barrier(compute())
+    blank = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(compute))
+    return jax.lax.cond(jax.lax.optimization_barrier(jnp.asarray(True)), compute, lambda: blank)
 
 
 def candidate_offsets(strides: Sequence[int], radius: int) -> Int[np.ndarray, "n 2"]:
@@ -144,13 +195,13 @@ def _check(
         fail("bad neighbourhood", "strides >= 1, radius >= 0, count >= 1", (strides, radius, count))
 
 
-def _inverse_sigma(sigma: Array | float) -> Array:
+def _inverse_sigma(sigma: Array | float, dtype: DTypeLike) -> Array:
     """1 / (sqrt(2) sigma): squares of scaled differences are then minus the logarithm of the Gaussian."""
-    return np.sqrt(0.5).item() / jnp.maximum(jnp.asarray(sigma, jnp.float32), _TINY_SIGMA)
+    return np.sqrt(0.5).item() / jnp.maximum(jnp.asarray(sigma, dtype), _TINY_SIGMA)
 
 
 class _Neighbourhood(NamedTuple):
-    """All that the weight of a candidate depends on."""
+    """All that the weight of a candidate depends on. Weights are computed in the dtype of the scales."""
 
     motion: Float[Array, "h w 2"]
     guide: Float[Array, "h w g"]
@@ -158,7 +209,6 @@ class _Neighbourhood(NamedTuple):
     """The previous guide, scaled and padded."""
     scale: Float[Array, " g"]
     scale_space: Float[Array, ""]
-    true: Bool[Array, ""]
 
 
 def _padded(guide: Float[Array, "h w g"], scale: Float[Array, " g"], pad: int) -> Float[Array, "hp wp g"]:
@@ -168,7 +218,7 @@ def _padded(guide: Float[Array, "h w g"], scale: Float[Array, " g"], pad: int) -
     a pixel whose guide is not finite.
     """
     finite = jnp.isfinite(guide).all(-1, keepdims=True)
-    scaled = jnp.where(finite, guide, 0).astype(jnp.float32) * scale[None, None, :]
+    scaled = jnp.where(finite, guide, 0).astype(scale.dtype) * scale[None, None, :]
     scaled = jnp.where(finite, jnp.clip(scaled, -_CLIP, _CLIP), _FAR)
     return jnp.pad(scaled, ((pad, pad), (pad, pad), (0, 0)), constant_values=_FAR)
 
@@ -179,17 +229,18 @@ def _centre(near: _Neighbourhood) -> tuple[Array, Array, Array, Array]:
     for axis, padded in ((0, near.there.shape[1]), (1, near.there.shape[0])):
         size = near.motion.shape[1 - axis]
         reach = (padded - size) // 4
-        m = jnp.where(_known(near.motion), near.motion[..., axis], 0).astype(jnp.float32)
+        m = jnp.where(_is_number(near.motion), near.motion[..., axis], 0).astype(near.scale.dtype)
         m = jnp.clip(m, -size - reach, size + reach)
         # Rounding the motion, not x - motion, keeps the fraction exact and a uniform motion uniform.
         whole = jax.lax.stop_gradient(jnp.round(m))
-        grid = jnp.arange(size)[None, :] if axis == 0 else jnp.arange(size)[:, None]
+        grid = jnp.arange(size, dtype=jnp.int32)
+        grid = grid[None, :] if axis == 0 else grid[:, None]
         parts.append((jnp.clip(grid - whole.astype(jnp.int32), -reach - 1, size + reach), m - whole))
     (x, fx), (y, fy) = parts
     return x, y, fx, fy
 
 
-def _known(motion: Float[Array, "h w 2"]) -> Bool[Array, "h w"]:
+def _is_number(motion: Float[Array, "h w 2"]) -> Bool[Array, "h w"]:
     return ~(jnp.isnan(motion[..., 0]) | jnp.isnan(motion[..., 1]))
 
 
@@ -210,9 +261,9 @@ def _pixel(near: _Neighbourhood) -> _Pixel:
     hp, wp, _ = near.there.shape
     x, y, fx, fy = _centre(near)
     planes = [near.guide[..., c] for c in range(channels)]
-    usable = functools.reduce(jnp.logical_and, map(jnp.isfinite, planes)) & _known(near.motion)
+    usable = functools.reduce(jnp.logical_and, map(jnp.isfinite, planes)) & _is_number(near.motion)
     here = [
-        jnp.clip(jnp.where(usable, plane, 0).astype(jnp.float32) * near.scale[c], -_CLIP, _CLIP)
+        jnp.clip(jnp.where(usable, plane, 0).astype(near.scale.dtype) * near.scale[c], -_CLIP, _CLIP)
         for c, plane in enumerate(planes)
     ]
     return _Pixel((y + (hp - h) // 2) * wp + x + (wp - w) // 2, fx, fy, here, usable)
@@ -227,7 +278,7 @@ def _distance(
     row = near.there.reshape(-1, channels).at[(pixel.corner + (dy * wp + dx)).astype(jnp.uint32)]
     there = row.get(mode="promise_in_bounds")
     # |xbar - y|^2 - |xbar - [xbar]|^2, free of cancellation.
-    sx, sy = jnp.asarray(dx, jnp.float32), jnp.asarray(dy, jnp.float32)
+    sx, sy = (jnp.asarray(d, near.scale.dtype) for d in (dx, dy))
     distance = (sx * (2 * pixel.fx + sx) + sy * (2 * pixel.fy + sy)) * jnp.square(near.scale_space)
     for c, here in enumerate(pixel.here):
         distance = distance + jnp.square(here - there[..., c])
@@ -242,32 +293,19 @@ def _select(near: _Neighbourhood, offsets: Int[np.ndarray, "n 2"], count: int) -
     outputs would each repeat the gathers.
     """
     bits = _tag_bits(offsets)
-    shape = near.motion.shape[:2]
-
-    def words() -> list[Array]:
-        pixel = _pixel(near)
-        best = [jnp.full(shape, np.float32(3e38))] * count
-        for number, (dx, dy) in enumerate(offsets.tolist()):
-            distance = _distance(near, pixel, dx, dy) + _NORMAL
-            key = jax.lax.bitcast_convert_type(distance, jnp.int32) >> bits << bits
-            key = jax.lax.bitcast_convert_type(key | number, jnp.float32)
-            for slot in range(count):  # insertion; where() is one instruction here, jnp.minimum is several
-                closer = best[slot] < key
-                best[slot], key = jnp.where(closer, best[slot], key), jnp.where(closer, key, best[slot])
-        tags = [jax.lax.bitcast_convert_type(b, jnp.uint32) & np.uint32((1 << bits) - 1) for b in best]
-        tags = [
-            jnp.where(pixel.usable, tag, 0) << np.uint32(i % (32 // bits) * bits)
-            for i, tag in enumerate(tags)
-        ]
-        return [
-            functools.reduce(jnp.bitwise_or, tags[i : i + 32 // bits]) for i in range(0, count, 32 // bits)
-        ]
-
-    # A loop that runs once; unlike lax.cond it stays one when a caller maps over a batch.
-    blank = [jnp.zeros(shape, jnp.uint32) for _ in range(0, count, 32 // bits)]
-    return jax.lax.while_loop(lambda s: s[0], lambda s: (jnp.zeros_like(s[0]), words()), (near.true, blank))[
-        1
-    ]
+    pixel = _pixel(near)
+    best = [jnp.full(near.motion.shape[:2], np.float32(3e38))] * count
+    for number, (dx, dy) in enumerate(offsets.tolist()):
+        distance = (_distance(near, pixel, dx, dy) + _NORMAL).astype(jnp.float32)
+        key = jax.lax.bitcast_convert_type(distance, jnp.int32) >> bits << bits
+        key = jax.lax.bitcast_convert_type(key | number, jnp.float32)
+        for slot in range(count):  # insertion; where() is one instruction here, jnp.minimum is several
+            closer = best[slot] < key
+            best[slot], key = jnp.where(closer, best[slot], key), jnp.where(closer, key, best[slot])
+    tags = [jax.lax.bitcast_convert_type(b, jnp.uint32) & np.uint32((1 << bits) - 1) for b in best]
+    per_word = 32 // bits
+    tags = [jnp.where(pixel.usable, tag, 0) << np.uint32(i % per_word * bits) for i, tag in enumerate(tags)]
+    return [functools.reduce(jnp.bitwise_or, tags[i : i + per_word]) for i in range(0, count, per_word)]
 
 
 def _unpack(
@@ -285,21 +323,25 @@ def _tag_bits(offsets: Int[np.ndarray, "n 2"]) -> int:
     return max(1, (len(offsets) - 1).bit_length())
 
 
+def _distances(
+    near: _Neighbourhood, words: list[UInt32[Array, "h w"]], offsets: Int[np.ndarray, "n 2"], count: int
+) -> Float[Array, "h w k"]:
+    """The distances of the selected candidates, differentiable; `_NOWHERE` where the pixel is not usable."""
+    pixel = jax.tree.map(lambda a: a[..., None], _pixel(near))
+    return jnp.where(pixel.usable, _distance(near, pixel, *_unpack(words, offsets, count)), _NOWHERE)
+
+
 def _filter(
     value: Float[Array, "h w c"],
     near: _Neighbourhood,
     words: list[UInt32[Array, "h w"]],
+    distance: Float[Array, "h w k"],
     offsets: Int[np.ndarray, "n 2"],
-    count: int,
 ) -> tuple[Float[Array, "h w c"], Float[Array, "h w 1"]]:
     """The normalised sum over the selected candidates, and the confidence. Plain differentiable code."""
     h, w, channels = value.shape
-
-    def distances() -> Array:
-        pixel = jax.tree.map(lambda a: a[..., None], _pixel(near))
-        return jnp.where(pixel.usable, _distance(near, pixel, *_unpack(words, offsets, count)), _NOWHERE)
-
-    distance = jax.lax.cond(near.true, distances, lambda: jnp.zeros((h, w, count)))
+    count = distance.shape[-1]
+    dtype = np.promote_types(value.dtype, distance.dtype)
     valid = distance[..., :1] < _NOWHERE
     # The first is the heaviest but for near-ties; the limit (not 0, where its gradient would be halved) only
     # acts on those of weights below exp(-10^6).
@@ -310,12 +352,13 @@ def _filter(
     weight = jnp.where(valid | (np.arange(count) > 0)[None, None, :], weight, 1)
 
     pixels = value.reshape(h * w, channels)
-    image, total = jnp.zeros(value.shape, jnp.float32), jnp.zeros((h, w, 1))
+    image, total = jnp.zeros(value.shape, dtype), jnp.zeros((h, w, 1), dtype)
     x, y, _, _ = _centre(near)
     dx, dy = _unpack(words, offsets, count)
+    weight = weight.astype(dtype)
     for k in range(count):
         index = jnp.clip(y + dy[..., k], 0, h - 1) * w + jnp.clip(x + dx[..., k], 0, w - 1)
-        pixel = pixels.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds").astype(jnp.float32)
+        pixel = pixels.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds").astype(dtype)
         # What weighs nothing may not be a number: a pixel without a guide may have no colour either.
         image = image + jnp.where(weight[..., k, None] > 0, pixel, 0) * weight[..., k, None]
         total = total + weight[..., k, None]
