@@ -207,7 +207,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
         yield temporary
         temporary.replace(path)
     except OSError as e:
-        raise JaxsrError("cannot write", where=path, found=e.strerror or e, fix="check the folder") from e
+        raise _cannot_write(path, temporary, e, "check the folder") from e
     finally:
         with contextlib.suppress(OSError):
             temporary.unlink(missing_ok=True)
@@ -236,9 +236,17 @@ def atomic_folder(path: Path, fix: str = "check the folder") -> Iterator[Path]:
             if not path.is_dir():
                 raise
     except OSError as e:
-        raise JaxsrError("cannot write", where=path, found=e.strerror or e, fix=fix) from e
+        raise _cannot_write(path, temporary, e, fix) from e
     finally:
         shutil.rmtree(temporary, ignore_errors=True)
+
+
+def _cannot_write(path: Path, temporary: Path, error: OSError, fix: str) -> JaxsrError:
+    found = str(error.strerror or error)
+    other = Path(error.filename) if isinstance(error.filename, str) else path
+    if other not in (path, path.parent, temporary) and temporary not in other.parents:
+        found = f"{found} ({other})"  # the block reads or writes something else, too
+    return JaxsrError("cannot write", where=path, found=found, fix=fix)
 
 
 def write_text(path: Path, text: str) -> None:

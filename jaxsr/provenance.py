@@ -81,10 +81,12 @@ def device_kind() -> str:
 
 
 def device() -> str:
-    """The devices that JAX computes on, such as "1 x NVIDIA H100 80GB HBM3, x86_64"."""
+    """The devices that JAX computes on, such as "1 x NVIDIA H100 80GB HBM3, x86_64"; a CPU with its cores."""
     import jax
 
-    return f"{len(jax.local_devices())} x {device_kind()}, {platform.machine()}"
+    devices = jax.local_devices()
+    kind = machine() if devices[0].platform == "cpu" else device_kind()
+    return f"{len(devices)} x {kind}, {platform.machine()}"
 
 
 def provenance() -> dict[str, Any]:

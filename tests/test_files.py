@@ -127,6 +127,16 @@ def test_a_folder_appears_whole_or_not_at_all(tmp_path):
         pass
 
 
+def test_an_error_of_the_block_names_its_file(tmp_path):
+    def fail():
+        with atomic_path(tmp_path / "a") as temporary:
+            temporary.write_bytes((tmp_path / "gone").read_bytes())
+
+    with pytest.raises(JaxsrError, match=r"/a: cannot write; found No such file or directory \(.*/gone\)"):
+        fail()
+    assert not list(tmp_path.iterdir())
+
+
 def test_texts_are_written_whole(tmp_path):
     write_text(tmp_path / "sub" / "a.txt", "é")
     assert (tmp_path / "sub" / "a.txt").read_bytes() == b"\xc3\xa9"
