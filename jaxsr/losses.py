@@ -3,7 +3,8 @@
 Arrays are `[H, W, C]` or `[B, H, W, C]`. Losses whose constants have a scale (Charbonnier, census, SSIM,
 LPIPS, VGG) want display-referred images in [0, 1], though a prediction may leave that range; the others
 take any. Gradients are finite everywhere, also where both images are identical or constant: every root and
-division has a constant in it that keeps it from zero.
+division has a constant in it that keeps it from zero. A loss has the wider type of its images; `lpips` and
+`vgg_l1` are float32.
 
 `lpips` is that of `jaxsr.nets.vgg`; it and `vgg_l1` need the extra `perceptual`.
 """
@@ -38,17 +39,25 @@ SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 
 
+def _of_one_type(*arrays: Array) -> tuple[Array, ...]:
+    """The arrays in the widest of their types: networks make float32 where the truth may be float64."""
+    with jax.numpy_dtype_promotion("standard"):
+        dtype = functools.reduce(jnp.promote_types, (a.dtype for a in arrays))
+    return tuple(a.astype(dtype) for a in arrays)
+
+
 def charbonnier(pred: Float[Array, "*b h w c"], target: Float[Array, "*b h w c"]) -> Float[Array, ""]:
     """Mean of sqrt(d^2 + 1e-6) (Lai et al. 2017; the constant is IFRNet's): L1, but smooth within 1e-3 of 0.
 
     Identical images give 1e-3.
     """
+    pred, target = _of_one_type(pred, target)
     return jnp.mean(jnp.sqrt(jnp.square(pred - target) + 1e-6))
 
 
 def _census(a: Array, b: Array, size: int) -> Array:
     """Soft Hamming distance of the census transforms of each channel, size x size."""
-    a, b = (x.reshape(-1, *x.shape[-3:]) for x in (a, b))
+    a, b = (x.reshape(-1, *x.shape[-3:]) for x in _of_one_type(a, b))
     radius = size // 2
     batch, height, width, channels = a.shape
     h, w = height - 2 * radius, width - 2 * radius
@@ -110,6 +119,7 @@ def hole_l1(
         pred, target: of any range.
         mask: 1 valid, 0 hole, as `jaxsr.ops.masks` makes them.
     """
+    pred, target, mask = _of_one_type(pred, target, mask)
     hole = 1 - jax.lax.stop_gradient(mask)
     area = jnp.sum(hole) * pred.shape[-1]
     # The area is a whole number: the guard acts where it is 0, and then so is the sum.
@@ -130,6 +140,7 @@ def hard_l1(
     """
     if not 0 < fraction <= 1:
         raise JaxsrError("bad fraction", where="hard_l1", expected="in (0, 1]", found=fraction)
+    pred, target = _of_one_type(pred, target)
     height, width, channels = pred.shape[-3:]
     error = jnp.abs(pred - target).reshape(-1, height * width, channels)
     count = max(math.floor(fraction * height * width + 1e-6), 1)  # 0.29 * 100 is 28.999...
@@ -177,6 +188,7 @@ def ssim_loss(pred: Float[Array, "*b h w c"], target: Float[Array, "*b h w c"]) 
             expected=f"at least {SSIM_WINDOW}x{SSIM_WINDOW}",
             found=f"{pred.shape[-3]}x{pred.shape[-2]}",
         )
+    pred, target = _of_one_type(pred, target)
     c1, c2 = 0.01**2, 0.03**2  # they also keep both denominators, and so the gradients, away from 0
     mean_p, mean_t = gaussian_window(pred), gaussian_window(target)
     # Only the sum of the two variances is needed: four windows, not five.
@@ -212,4 +224,5 @@ def temporal_l1(
         image: I_t.
         warped_previous: the previous output after `jaxsr.ops.backward_warp`; gradients reach it too.
     """
+    image, warped_previous = _of_one_type(image, warped_previous)
     return jnp.mean(jnp.abs(image - warped_previous))

@@ -2,7 +2,7 @@
 
 All take images `[H, W, 3]` in [0, 1], sRGB-encoded after the tone map (`jaxsr.ops.color.to_display`). `psnr`,
 `ssim`, `lpips` and `flip` return a Python float, `flip_map` an array `[H, W]`; `temporal_psnr` and `measure`
-take frames in order and return lists of one float or None a frame. No metric crops, converts to luma, or
+take frames in order and return lists of one float or None per frame. No metric crops, converts to luma, or
 quantises. Values outside [0, 1], NaN and unequal shapes are errors, never a number. They compute on the host
 and are no losses (those are in `jaxsr.losses`).
 
@@ -11,12 +11,14 @@ SSIM, LPIPS and FLIP there still see the neighbours of masked pixels. An empty m
 `measure_frame` has every metric of a frame over all pixels and over any regions, and makes each map once.
 
 LPIPS needs the extra `perceptual`; without it `available` has no "lpips", and `measure` leaves it out. It
-costs several times as much as all the others together.
+costs several times as much as all the others together. "lpips_alex", the same over AlexNet, judges networks
+whose training has seen LPIPS over VGG-16; it is measured only where `keys` asks for it.
 
-PSNR of identical images is `inf`; tables.py writes that as the string "inf" in JSON, for JSON has no number
-for it. A value that is not defined (the temporal PSNR of the first frame) is None, `null` in JSON.
+PSNR of identical images is `inf`; `jaxsr.report.tables` writes that as the string "inf" in JSON, for JSON has
+no number for it. A value that is not defined (the temporal PSNR of the first frame) is None, `null` in JSON.
 """
 
+import functools
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import NamedTuple, TypeAlias
@@ -72,6 +74,14 @@ METRICS: dict[str, Metric] = {
         "Zhang et al. 2018, LPIPS v0.1 over VGG-16, of the whole display-referred image at its own size. "
         "Over a region: the mean there of the layers' maps, enlarged bilinearly.",
     ),
+    "lpips_alex": Metric(
+        "LPIPS-Alex",
+        "",
+        False,
+        4,
+        "LPIPS v0.1 over AlexNet, otherwise as LPIPS. Networks that are trained with LPIPS see VGG-16 and "
+        "never AlexNet.",
+    ),
     "flip": Metric(
         "FLIP",
         "",
@@ -89,6 +99,10 @@ METRICS: dict[str, Metric] = {
         "flicker lowers it, a constant error does not. Not defined for the first frame or across a cut.",
     ),
 }
+
+OPTIONAL = ("lpips_alex",)
+"""Metrics that are measured only where they are asked for."""
+_LPIPS: dict[str, perceptual.Net] = {"lpips": "vgg", "lpips_alex": "alex"}
 
 
 def _checked(image: Array | np.ndarray, truth: Array | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -185,31 +199,45 @@ def _average(values: np.ndarray, mask: Mask | None, edge: int = 0) -> float:
     return float(values.mean(dtype=np.float64))
 
 
-@jax.jit
-def _lpips_value(image: Array, truth: Array, params: perceptual.Params) -> Array:
-    return perceptual.lpips(image, truth, "vgg", params)
+@functools.partial(jax.jit, static_argnames="net")
+def _lpips_value(image: Array, truth: Array, params: perceptual.Params, net: perceptual.Net) -> Array:
+    return perceptual.lpips(image, truth, net, params)
 
 
-@jax.jit
-def _lpips_maps(image: Array, truth: Array, params: perceptual.Params) -> tuple[Array, Array]:
-    """The value and the map. The networks run once: the compiler sees that both have the same."""
-    found = perceptual.lpips_map(image, truth, "vgg", params)
-    return perceptual.lpips(image, truth, "vgg", params), found
+@functools.partial(jax.jit, static_argnames="net")
+def _lpips_both(
+    image: Array, truth: Array, params: perceptual.Params, net: perceptual.Net
+) -> tuple[Array, Array]:
+    """The value and the map. The networks run once: the compiler sees that both need the same features."""
+    found = perceptual.lpips_map(image, truth, net, params)
+    return perceptual.lpips(image, truth, net, params), found
 
 
-def lpips(image: Image, truth: Image, mask: Mask | None = None) -> float:
-    """LPIPS v0.1 over VGG-16 (Zhang et al. 2018): 0 for identical images, lower is better.
+def _lpips_over(
+    image: np.ndarray, truth: np.ndarray, net: perceptual.Net, needs_map: bool
+) -> Callable[[np.ndarray | None], float]:
+    """LPIPS over a mask, or over all pixels for None, which is not the mean of the map."""
+    params = perceptual.load_params(net)
+    if not needs_map:
+        value = float(_lpips_value(image, truth, params, net))
+        return lambda mask: value
+    whole, values = (np.asarray(x) for x in _lpips_both(image, truth, params, net))
+    return lambda mask: float(whole) if mask is None else _average(values, mask)
 
-    Over a mask it is the mean of `jaxsr.nets.vgg.lpips_map`. Compiled once a size.
+
+def lpips(image: Image, truth: Image, mask: Mask | None = None, net: perceptual.Net = "vgg") -> float:
+    """LPIPS v0.1 (Zhang et al. 2018) over VGG-16 or AlexNet: 0 for identical images, lower is better.
+
+    Over a mask it is the mean of `jaxsr.nets.vgg.lpips_map`. Compiled once per size.
 
     Raises:
-        JaxsrError: as for `psnr`, images below 16x16, and where the extra `perceptual` is not installed.
+        JaxsrError: as for `psnr`, images below 16x16 (AlexNet: 31x31), and where the extra `perceptual` is
+            not installed.
     """
     image_, truth_ = _checked(image, truth)
-    params = perceptual.load_params("vgg")
-    if mask is None:
-        return float(_lpips_value(image_, truth_, params))
-    return _average(np.asarray(_lpips_maps(image_, truth_, params)[1]), mask)
+    if mask is not None:
+        mask = _checked_mask(mask, truth_.shape[:2])
+    return _lpips_over(image_, truth_, net, mask is not None)(mask)
 
 
 def flip_map(image: Image, truth: Image, ppd: float = FLIP_PPD) -> Float[np.ndarray, "h w"]:
@@ -244,7 +272,7 @@ def temporal_psnr(
     mask: Mask | None = None,
     starts: Sequence[bool] | None = None,
 ) -> list[float | None]:
-    """PSNR of `image_t - image_{t-1}` against `truth_t - truth_{t-1}`, peak 1, one value a frame.
+    """PSNR of `image_t - image_{t-1}` against `truth_t - truth_{t-1}`, peak 1, one value per frame.
 
     Differences lie in [-1, 1], but the peak stays 1 so that the scale is that of `psnr`. An error that
     stays the same from frame to frame costs nothing; flicker does.
@@ -255,7 +283,7 @@ def temporal_psnr(
         starts: True where a frame does not follow the one before it (a cut, a gap in the numbers).
 
     Returns:
-        One value a frame; None for frame 0 and for every start.
+        One value per frame; None for frame 0 and for every start.
 
     Raises:
         JaxsrError: unequal lengths, and as for `psnr`.
@@ -288,8 +316,12 @@ def _change(error: np.ndarray, previous: np.ndarray) -> np.ndarray:
 
 
 def available() -> tuple[str, ...]:
-    """Keys of the metrics that can be computed here: `METRICS`, less "lpips" where its extra is absent."""
-    return tuple(key for key in METRICS if key != "lpips" or perceptual.installed())
+    """Keys of the metrics that are measured unless others are asked for.
+
+    Those of `METRICS` without the `OPTIONAL` ones, and without "lpips" where its extra is not installed.
+    """
+    left_out = {*OPTIONAL, *(() if perceptual.installed() else _LPIPS)}
+    return tuple(key for key in METRICS if key not in left_out)
 
 
 def measure_frame(
@@ -314,8 +346,7 @@ def measure_frame(
         region -> metric -> value. Images too small for SSIM or LPIPS have None there.
 
     Raises:
-        JaxsrError: as for `psnr`; an unknown metric; a region named "all"; "lpips" asked for without its
-        extra.
+        JaxsrError: as for `psnr`; an unknown metric; a region named "all"; LPIPS asked for without its extra.
     """
     keys = available() if keys is None else keys
     regions = regions or {}
@@ -340,14 +371,9 @@ def measure_frame(
     if "ssim" in keys and size >= SSIM_WINDOW:
         ssim_map, edge = _channel_mean(_ssim_map(image_, truth_)), SSIM_WINDOW // 2
         note("ssim", lambda mask: _average(ssim_map, mask, edge), edge)
-    if "lpips" in keys and size >= perceptual.MIN_SIZE["vgg"]:
-        params = perceptual.load_params("vgg")
-        # The map is made where it is asked for; the value of the whole image is not its mean.
-        if masks:
-            value, enlarged = (np.asarray(x) for x in _lpips_maps(image_, truth_, params))
-        else:
-            value, enlarged = np.asarray(_lpips_value(image_, truth_, params)), np.zeros(truth_.shape[:2])
-        note("lpips", lambda mask: float(value) if mask is None else _average(enlarged, mask))
+    for key, net in _LPIPS.items():
+        if key in keys and size >= perceptual.MIN_SIZE[net]:
+            note(key, _lpips_over(image_, truth_, net, bool(masks)))
     if "flip" in keys:
         errors = flip_map(image_, truth_) if flip_error is None else flip_error
         note("flip", lambda mask: _average(errors, mask))
@@ -369,7 +395,7 @@ def measure(
 
     Images too small for SSIM or LPIPS have None there. `starts` is that of `temporal_psnr`; `flip_maps` are
     those of `flip_map` at its default distance, if they were made already; `keys` are those of the metrics
-    that are wanted, if not all.
+    that are wanted, if not those of `available`.
     """
     _check_lengths(images, truths, starts)
     pairs = list(zip(images, truths, strict=True))

@@ -25,7 +25,7 @@ PIXELWISE = {
     "hard_l1": losses.hard_l1,
     "ssim_loss": losses.ssim_loss,
     "temporal_l1": losses.temporal_l1,
-    "hole_l1": lambda a, b: losses.hole_l1(a, b, jnp.zeros((*a.shape[:-1], 1))),
+    "hole_l1": lambda a, b: losses.hole_l1(a, b, jnp.zeros((*a.shape[:-1], 1), jnp.float32)),
 }
 each_loss = pytest.mark.parametrize("loss", PIXELWISE.values(), ids=PIXELWISE)
 
@@ -173,6 +173,23 @@ def test_gradients_are_finite_where_images_are_degenerate(loss, pred, target):
     value, gradients = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(pred, target)
     assert np.isfinite(value)
     assert all(np.isfinite(g).all() for g in gradients)
+
+
+@each_loss
+@pytest.mark.parametrize("types", [("float64", "float64"), ("float32", "float64"), ("float64", "float32")])
+def test_double_precision(loss, types):
+    """Of images of two types the wider is the loss's, and each gradient has the type of its image."""
+    with jax.enable_x64(True):
+        pair = [jax.ShapeDtypeStruct((1, 16, 16, 3), kind) for kind in types]
+        value, gradients = jax.eval_shape(jax.value_and_grad(loss, argnums=(0, 1)), *pair)
+    assert (value.dtype, *(g.dtype for g in gradients)) == ("float64", *types)
+
+
+def test_a_loss_of_doubles_has_their_digits():
+    with jax.enable_x64(True):
+        d = jnp.full((4, 4, 1), 1e-9, jnp.float64)
+        value = losses.temporal_l1(1 + d, jnp.ones_like(d))
+    assert float(value) == pytest.approx(1e-9, rel=1e-6)
 
 
 def test_no_holes_have_no_gradient():

@@ -4,6 +4,7 @@ import math
 
 import hypothesis
 import hypothesis.strategies as st
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -202,6 +203,25 @@ def test_lpips_of_a_region_is_the_mean_of_its_map():
     assert found["left"]["lpips"] == pytest.approx(metrics.lpips(half, truth, left), rel=1e-4)
     assert found["left"]["lpips"] < found["right"]["lpips"]
     assert metrics.lpips(truth, truth) == pytest.approx(0, abs=1e-9)
+
+
+@needs_lpips
+def test_lpips_over_alexnet_is_measured_where_it_is_asked_for():
+    assert "lpips" in metrics.available()
+    assert "lpips_alex" not in metrics.available()
+    image, truth = pair(40, 40)
+    left = np.zeros((40, 40), bool)
+    left[:, :20] = True
+    found = metrics.measure_frame(image, truth, regions={"left": left}, keys=["lpips_alex"])
+    assert list(found["all"]) == ["lpips_alex"]
+    params = perceptual.load_params("alex")
+    expected = float(jax.jit(lambda a, b, p: perceptual.lpips(a, b, "alex", p))(image, truth, params))
+    assert found["all"]["lpips_alex"] == pytest.approx(expected, rel=1e-5)
+    assert found["left"]["lpips_alex"] == pytest.approx(
+        metrics.lpips(image, truth, left, net="alex"), rel=1e-5
+    )
+    small = metrics.measure([image[:30, :30]], [truth[:30, :30]], keys=["lpips_alex"])
+    assert small == {"lpips_alex": [None]}  # AlexNet needs 31x31
 
 
 @pytest.mark.parametrize(

@@ -102,8 +102,8 @@ class RCAN(nnx.Module):
 
     def __call__(self, color: Float[Array, "b h w 3"]) -> Float[Array, "b H W 3"]:
         """Make the HR colour."""
-        mean = jnp.array(MEAN).reshape(1, 1, 1, 3)
-        first = self.head(color - mean)
+        mean = jnp.array(MEAN, jnp.float32).reshape(1, 1, 1, 3)
+        first = self.head(color.astype(jnp.float32) - mean)
         x = first + self.last(through(first, self.groups))
         for up in self.ups:
             x = up(x)

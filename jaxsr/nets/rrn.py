@@ -79,6 +79,7 @@ class RRN(nnx.Module):
         output: Float[Array, "b H W 3"],
     ) -> tuple[Float[Array, "b H W 3"], Float[Array, "b h w n"]]:
         """The output o_t and the hidden state h_t, from I_{t-1}, I_t, h_{t-1} and o_{t-1}."""
+        previous, color, hidden, output = (x.astype(jnp.float32) for x in (previous, color, hidden, output))
         x = jnp.concatenate([previous, color, hidden, pixel_unshuffle(output, self.scale)], axis=-1)
         x = nnx.relu(self.first(x))
         for block in self.blocks:

@@ -10,7 +10,7 @@ import pytest
 from flax import nnx
 
 from jaxsr.errors import JaxsrError
-from jaxsr.nets import FusionSR, UNetSR
+from jaxsr.nets import NSRR, RCAN, RRN, FusionSR, UNetSR
 from jaxsr.nets.blocks import (
     XAVIER,
     LoopConv,
@@ -312,6 +312,41 @@ def test_size_of_the_export_may_be_open():
     exported = jax.export.export(jax.jit(lambda c, g: run(state, c, g)))(*shapes)
     inputs = _inputs(7)
     np.testing.assert_allclose(exported.call(*inputs), run(state, *inputs), atol=1e-5)
+
+
+def nsrr_steps(net, rgbd):
+    return net.reconstruct(net.features(rgbd), net.previous_features(rgbd)[:, None])
+
+
+COLOR, WIDE = (1, 4, 4, 3), (1, 8, 8, 3)
+EVERY_NET = {
+    "fusion": (FusionSR, [COLOR, (1, 8, 8, 9)]),
+    "unet": (UNetSR, [COLOR, (1, 8, 8, 9)]),
+    "rcan": (functools.partial(RCAN, scale=2, groups=1, blocks=1, features=4, reduction=2), [COLOR]),
+    "rrn": (functools.partial(RRN, scale=2, blocks=1, features=4), [COLOR, COLOR, (1, 4, 4, 4), WIDE]),
+    "nsrr": (functools.partial(NSRR, previous=1), [(1, 8, 8, 4)], nsrr_steps),
+}
+
+
+@pytest.mark.parametrize("name", EVERY_NET)
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+@pytest.mark.parametrize("images", ["float32", "float64"])
+def test_where_doubles_are_allowed_networks_stay_float32(name, dtype, images):
+    """Whatever the type of the images: parameters, their gradients, and the output."""
+    make, shapes, *other = EVERY_NET[name]
+    call = other[0] if other else lambda net, *inputs: net(*inputs)
+
+    with jax.enable_x64(True):
+        net = nnx.eval_shape(lambda: make(dtype=dtype, rngs=nnx.Rngs(0)))
+        graph, params, rest = nnx.split(net, nnx.Param, ...)
+
+        def total(params, rest, *inputs):
+            out = call(nnx.merge(graph, params, rest, copy=True), *inputs)
+            return sum(jnp.sum(x) for x in jax.tree.leaves(out)), out
+
+        inputs = [jax.ShapeDtypeStruct(shape, images) for shape in shapes]
+        found = jax.eval_shape(jax.grad(total, has_aux=True), params, rest, *inputs)
+    assert {x.dtype for x in jax.tree.leaves(found)} == {jnp.dtype("float32")}
 
 
 @pytest.mark.parametrize(
