@@ -68,13 +68,13 @@ def table(sections: list[SequenceResult], task: str) -> list[str]:
     ]
     for section in chosen:
         subset = section.subsets()["extrapolated" if task == "extrapolation" else "all"]
-        for track in section.tracks:
+        for result in section.methods:
             cells = []
             for key in keys:
-                text = cell(summary(track, key, subset), key)
-                cells.append(f"**{text}**" if track.name in best(section, key, subset) else text)
-            name = LABELS[task].get(track.name, f"`{track.name}`")
-            time_ms = duration(track.timing.median_ms) if track.timing else ""
+                text = cell(summary(result, key, subset), key)
+                cells.append(f"**{text}**" if result.name in best(section, key, subset) else text)
+            name = LABELS[task].get(result.name, f"`{result.name}`")
+            time_ms = duration(result.timing.median_ms) if result.timing else ""
             scene = str(section.meta["sequence"]).split("-")[0]
             lines.append(f"| {scene} x{section.meta['scale']} | {name} | {' | '.join(cells)} | {time_ms} |")
     return lines
@@ -113,12 +113,12 @@ def readme_block(document: dict[str, Any]) -> str:
             f"| method | {' | '.join(scenes)} |",
             "|---|" + "---|" * len(scenes),
         ]
-        for k, track in enumerate(chosen[0]["tracks"]):
+        for k, result in enumerate(chosen[0]["tracks"]):
             cells = []
             for section in chosen:
                 found = section["tracks"][k]["summary"][subset]
                 cells.append(" · ".join(f"{found[key]['mean']:.{README[key][1]}f}" for key in keys))
-            name = LABELS[task].get(track["name"], f"`{track['name']}`")
+            name = LABELS[task].get(result["name"], f"`{result['name']}`")
             lines.append(f"| {name} | {' | '.join(cells)} |")
         lines.append("")
     return "\n".join(lines)
@@ -143,9 +143,9 @@ def strip(section: SequenceResult, frame: int) -> np.ndarray:
     """The truth with the crop marked, then the crop of the input, each method and the truth, enlarged."""
     i = list(section.frames).index(frame)
     truth = pixels(section.truths[i])
-    tracks = [t for t in section.tracks if t.name not in ("nearest", "bicubic")]
+    results = [t for t in section.methods if t.name not in ("nearest", "bicubic")]
     labels = {n: label.replace("`", "") for n, label in LABELS[task_of(section)].items()}
-    images = {labels.get(t.name, t.name): pixels(t.images[i]) for t in tracks}
+    images = {labels.get(t.name, t.name): pixels(t.images[i]) for t in results}
     x, y = busiest(truth, list(images.values()))
     (w, h), zoom = CROP, 4
     given = section.inputs[i]

@@ -140,9 +140,9 @@ def upscale(
         every: every n-th frame counts as rendered; the others are extrapolated.
         out: folder for `exr/` (linear) and `png/` (as shown).
     """
-    from jaxsr.evaluation.running import upscale as upscale_sequence
     from jaxsr.io.sequence import Sequence
     from jaxsr.runtime.load import find_method
+    from jaxsr.runtime.upscale import upscale as upscale_sequence
 
     opened = Sequence.open(sequence)
     scale = scale or max(opened.scales, default=1)

@@ -54,7 +54,7 @@ def test_pictures_of_frames_in_memory_and_on_disk_are_alike(tmp_path):
     made[20:60, 40:104] = 0
 
     def section(convert):
-        tracks = [
+        results = [
             MethodResult(name, [convert(name, image)], {"psnr": [20.0]}) for name, image in images.items()
         ]
         truths, inputs = [convert("truth", truth)], [convert("input", low)]
@@ -62,7 +62,7 @@ def test_pictures_of_frames_in_memory_and_on_disk_are_alike(tmp_path):
             "a",
             [6],
             truths,
-            tracks,
+            results,
             inputs=inputs,
             extrapolated=[False],
             meta={"sequence": "a-0", "scale": 2},

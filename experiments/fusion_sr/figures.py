@@ -23,13 +23,13 @@ from PIL import Image, ImageDraw, ImageFont  # noqa: E402
 
 from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
-from jaxsr.evaluation.measuring import display  # noqa: E402
 from jaxsr.io.images import write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
 from jaxsr.metrics import METRICS, available, measure_frame  # noqa: E402
 from jaxsr.runtime.load import LoadedMethod, find_method  # noqa: E402
 from jaxsr.runtime.schedule import check_needs, observed  # noqa: E402
 from jaxsr.runtime.stream import stream  # noqa: E402
+from jaxsr.runtime.upscale import display  # noqa: E402
 
 METHODS = ("bicubic", "taau", "guided-taau")
 COLORS = ((230, 60, 50), (40, 150, 255))

@@ -39,12 +39,12 @@ from experiments.fusion_sr.tables import IMAGES, PAGE, on_page, write  # noqa: E
 from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
-from jaxsr.evaluation.measuring import display  # noqa: E402
 from jaxsr.evaluation.regions import disocclusions  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.images import read_png, write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
 from jaxsr.ops import backward_warp  # noqa: E402
+from jaxsr.runtime.upscale import display  # noqa: E402
 
 CURRENT = ("bicubic", "rcan", "fusion", "fusion-zero", "fusion-guided")
 HISTORY = ("taau", "guided-taau", "nsrr", "rrn")

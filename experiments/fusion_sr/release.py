@@ -100,9 +100,9 @@ def table(sections: list[SequenceResult]) -> list[str]:
     ]
     for section in sections:
         everything = section.subsets()["all"]
-        for track in section.tracks:
-            cells = [cell(summary(track, key, everything), key) for key in keys]
-            lines.append(f"| {section.title.split(',')[0]} | `{track.name}` | " + " | ".join(cells) + " |")
+        for result in section.methods:
+            cells = [cell(summary(result, key, everything), key) for key in keys]
+            lines.append(f"| {section.title.split(',')[0]} | `{result.name}` | " + " | ".join(cells) + " |")
     return lines
 
 
@@ -122,7 +122,7 @@ def card(name: str, run: Run, head: dict[str, Any], sections: list[SequenceResul
         "scenes": ", ".join(run.scenes),
         "hours": f"{training['seconds'] / 3600:.2f}",
         "origin": f"; starts from the weights of [`{run.start}`]({run.start}.md)" if run.start else "",
-        "track": sections[0].tracks[-1].name,
+        "track": sections[0].methods[-1].name,
         "table": "\n".join(table(sections)),
         "measured": time.strftime("%Y-%m-%d"),
         "day": training["made"]["date"][:10],

@@ -37,7 +37,7 @@ from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
 from jaxsr.evaluation.measuring import Reference  # noqa: E402
-from jaxsr.evaluation.running import Settings, run_method  # noqa: E402
+from jaxsr.evaluation.running import Evaluation, Settings, run_method  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
 from jaxsr.methods import LEARNED, Method, build, fusion_sr  # noqa: E402
@@ -168,19 +168,19 @@ def measure(ready: LoadedMethod, clips: list[Path], frames: Path) -> dict[str, A
         sequences = [FrameSequence.open(clip) for clip in clips]
         advance = progress("measure", 2 * sum(map(len, sequences)))
         for sequence in sequences:
-            settings = Settings(SCALE, warmup=WARM_UP)
             reference = Reference(sequence, in_regions=True)
-            track = run_method(sequence, ready, frames / sequence.name, settings, reference, advance)
-            assert track.cost is not None
+            evaluation = Evaluation(sequence, Settings(SCALE, warmup=WARM_UP), reference, advance)
+            result = run_method(evaluation, ready, frames / sequence.name)
+            assert result.cost is not None
             scenes[sequence.name.split("-")[0]] = {
                 "sequence": sequence.name,
                 "frames": [info.index for info in sequence.infos[WARM_UP:]],
-                "metrics": track.metrics,
-                "regions": track.regions,
+                "metrics": result.metrics,
+                "regions": result.regions,
             }
     measured = description(scale=SCALE, warm_up=WARM_UP)
     measured["seconds"] = round(time.monotonic() - begun, 1)
-    return {"measured": measured, "cost": dataclasses.asdict(track.cost), "scenes": scenes}
+    return {"measured": measured, "cost": dataclasses.asdict(result.cost), "scenes": scenes}
 
 
 def run(name: str, seed: int, data: tuple[Path, ...], runs: Path, clips: list[Path]) -> dict[str, Any]:

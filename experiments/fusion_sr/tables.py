@@ -29,12 +29,12 @@ from experiments.fusion_sr.figures import Shown, sheet  # noqa: E402
 from experiments.fusion_sr.study import RESULTS, RUNS, SCALE, VARIANTS, WARM_UP, results_file  # noqa: E402
 from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
-from jaxsr.evaluation.measuring import display  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.images import read_png, write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
 from jaxsr.methods import build  # noqa: E402
 from jaxsr.metrics import METRICS  # noqa: E402
+from jaxsr.runtime.upscale import display  # noqa: E402
 
 PAGE = ROOT / "docs" / "results_fusion_sr.md"
 IMAGES = ROOT / "docs" / "images"

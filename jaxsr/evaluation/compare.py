@@ -224,7 +224,7 @@ def compare(
             title=f"{truth.resolve().name}: {', '.join(names)}" if len(names) < 4 else truth.resolve().name,
             frames=true.numbers or tuple(range(1, len(true.files) + 1)),
             truths=[shown.path("truth", file) for file in true.files],
-            tracks=[
+            methods=[
                 _measured(name, frames, true, starts, shown, Meter(keys), advance)
                 for name, frames in zip(names, found, strict=True)
             ],
@@ -240,9 +240,9 @@ def compare(
     return dataclasses.replace(
         section,
         truths=[shown.path("truth", file) for file in true.files],
-        tracks=[
-            dataclasses.replace(track, images=[shown.path(f"frames/{name}", file) for file in frames.files])
-            for track, name, frames in zip(section.tracks, names, found, strict=True)
+        methods=[
+            dataclasses.replace(result, images=[shown.path(f"frames/{name}", file) for file in frames.files])
+            for result, name, frames in zip(section.methods, names, found, strict=True)
         ],
     )
 
@@ -313,4 +313,4 @@ def _measured(
                 )
         meter.add([image], [Truth(truth, {})], [start])
         advance()
-    return meter.track(name, [shown.path(f"frames/{name}", file) for file in frames.files])
+    return meter.result(name, [shown.path(f"frames/{name}", file) for file in frames.files])

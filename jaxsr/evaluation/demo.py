@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from jaxsr.evaluation.measuring import Reference, metrics_with
-from jaxsr.evaluation.running import Settings, run_methods
+from jaxsr.evaluation.running import Evaluation, Settings, run_methods
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.progress import Progress
 from jaxsr.provenance import provenance
@@ -63,14 +63,12 @@ def run_demo(
     for sequence in opened:
         reference = Reference(sequence)
         for task in tasks:
+            settings = Settings(scale, task.every, metrics=metrics_with(lpips))
             sections.append(
                 run_methods(
-                    sequence,
+                    Evaluation(sequence, settings, reference, advance),
                     [find_method(name, scale) for name in task.methods],
                     out / sequence.name / task.name,
-                    Settings(scale, task.every, metrics=metrics_with(lpips)),
-                    reference=reference,
-                    advance=advance,
                     compiled=compiled,
                 )
             )
@@ -100,8 +98,8 @@ class _Task(NamedTuple):
 
 def _write_video(path: Path, section: SequenceResult, names: Sequence[str], fps: float) -> None:
     """Input, two methods and truth, two by two; the clip is short and plays four times."""
-    tracks = {t.name: t.images for t in section.tracks}
-    shown = {"input": enlarged(section), **{n: tracks[n] for n in names}, "truth": section.truths}
+    images = {result.name: result.images for result in section.methods}
+    shown = {"input": enlarged(section), **{n: images[n] for n in names}, "truth": section.truths}
     extrapolated = section.extrapolated or [False] * len(section.frames)
     captions = [
         f"frame {n}{', extrapolated' if e else ''}" for n, e in zip(section.frames, extrapolated, strict=True)

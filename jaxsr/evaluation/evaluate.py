@@ -1,7 +1,7 @@
 """`jaxsr evaluate`: methods over sequences, each against the truth; tables, the comparison page, all numbers.
 
 Writes `out/<sequence>/<method>/` (frames, error maps, results), and into `out` report.html, metrics.json,
-.csv and .md. What was finished is kept (`kept.py`): an interrupted evaluation goes on when it is run again.
+.csv and .md. What is finished is kept (`kept.py`): the same command continues an interrupted evaluation.
 """
 
 import copy
@@ -14,7 +14,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.compare import labels
 from jaxsr.evaluation.kept import run_kept
 from jaxsr.evaluation.measuring import Reference
-from jaxsr.evaluation.running import Settings, run_methods
+from jaxsr.evaluation.running import Evaluation, Settings, run_methods
 from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.progress import Progress
@@ -31,24 +31,24 @@ def find_methods(names: Sequence[str], scale: int) -> list[LoadedMethod]:
     Raises:
         JaxsrError: as for `find_method`; no name; two that would be called the same.
     """
-    found: dict[str, LoadedMethod] = {}
+    methods: dict[str, LoadedMethod] = {}
     for name in names:
-        ready = find_method(name, scale)
-        if ready.method.name in found:
+        loaded = find_method(name, scale)
+        if loaded.method.name in methods:
             raise JaxsrError(
-                f"two methods are called {ready.method.name!r}",
+                f"two methods are called {loaded.method.name!r}",
                 where="--methods",
                 found=", ".join(names),
                 fix="name each once; rename a file of weights",
             )
-        found[ready.method.name] = ready
-    if not found:
+        methods[loaded.method.name] = loaded
+    if not methods:
         raise JaxsrError("no methods to evaluate", where="--methods", fix="name at least one")
-    return list(found.values())
+    return list(methods.values())
 
 
 def part(sequence: FrameSequence, frames: tuple[int, int] | None) -> FrameSequence:
-    """A sequence of the frames with numbers in a range alone, ends included; it begins anew.
+    """A sequence of those frames alone whose numbers are in a range, ends included; the first one is a reset.
 
     Raises:
         JaxsrError: there are none, or not all.
@@ -58,18 +58,18 @@ def part(sequence: FrameSequence, frames: tuple[int, int] | None) -> FrameSequen
     infos = [info for info in sequence.infos if frames[0] <= info.index <= frames[1]]
     if not infos or frames[0] < sequence.infos[0].index or frames[1] > sequence.infos[-1].index:
         raise JaxsrError(
-            "the range has frames that the sequence has not" if infos else "no frame in the range",
+            "the range has frames that the sequence does not have" if infos else "no frame in the range",
             where=sequence.path,
             expected=f"some of {sequence.infos[0].index}:{sequence.infos[-1].index}",
             found=f"{frames[0]}:{frames[1]}",
         )
-    found = copy.copy(sequence)
-    found.infos = [dataclasses.replace(infos[0], reset=True), *infos[1:]]
-    return found
+    some = copy.copy(sequence)
+    some.infos = [dataclasses.replace(infos[0], reset=True), *infos[1:]]
+    return some
 
 
 def _check(sequence: FrameSequence, methods: Sequence[LoadedMethod], settings: Settings) -> None:
-    """See that all can be run and measured, before any work is done."""
+    """See that every method can be run and measured, before any work is done."""
     for i in range(len(sequence)):
         if "color" not in sequence.layers("hr", i):
             raise JaxsrError(
@@ -79,8 +79,8 @@ def _check(sequence: FrameSequence, methods: Sequence[LoadedMethod], settings: S
                 fix="render it, or use `jaxsr upscale`, which needs none",
             )
     settings.check(sequence)
-    for ready in methods:
-        check_needs(ready.method, sequence, settings.scale)
+    for loaded in methods:
+        check_needs(loaded.method, sequence, settings.scale)
 
 
 def evaluate(
@@ -104,32 +104,28 @@ def evaluate(
         progress: told of each frame that is made and measured.
 
     Returns:
-        A section a sequence; `rich_tables` prints them.
+        One result per sequence; `rich_tables` prints them.
 
     Raises:
         JaxsrError: see `find_sequences`, `find_methods`, `part`, `check_needs`, `run_methods`.
     """
     if out.exists() and not out.is_dir():
         raise JaxsrError("not a folder", where=out, fix="choose another --out")
-    ready = find_methods(methods, settings.scale)
+    loaded = find_methods(methods, settings.scale)
     paths = find_sequences(places)
     names = labels(paths)
     sequences = [part(FrameSequence.open(path), frames) for path in paths]
     for sequence in sequences:
-        _check(sequence, ready, settings)
-    advance = progress("frames", 2 * len(ready) * sum(map(len, sequences)))  # made, and measured
+        _check(sequence, loaded, settings)
+    advance = progress("frames", 2 * len(loaded) * sum(map(len, sequences)))  # made, and measured
     compiled: dict[Any, float] = {}
     sections = [
         run_methods(
-            sequence,
-            ready,
+            Evaluation(sequence, settings, Reference(sequence, in_regions=True), advance, name),
+            loaded,
             out / name,
-            settings,
-            reference=Reference(sequence, in_regions=True),
-            advance=advance,
             compiled=compiled,
             run=run_kept,
-            title=name,
         )
         for name, sequence in zip(names, sequences, strict=True)
     ]

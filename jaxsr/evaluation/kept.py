@@ -1,70 +1,83 @@
 """Results that are kept: a method that was run and measured over a sequence is not run again.
 
 `out/<method>/result.json` holds what was measured, and the key: all that it depends on, as hashes where that
-is long. A record without results, as an interrupted run leaves it, or with another key, is made anew.
+is long. A record without results, as an interrupted run leaves it, or with another key, is made anew. The key
+covers the code of a method of the user's own too (`code.py`), and the machine, whose times are in the record.
+
+Only files that `run.json` names are ever replaced or deleted (`runtime/record.py`).
 """
 
 import importlib.resources
 import json
 import math
-import shutil
+import platform
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jaxsr
-from jaxsr.evaluation.measuring import Reference
-from jaxsr.evaluation.running import Settings, check_folder, png_file, run_method
-from jaxsr.files import atomic_path, digest
-from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.errors import JaxsrError
+from jaxsr.evaluation.code import UnknownCodeError, method_digest
+from jaxsr.evaluation.running import Evaluation, run_method
+from jaxsr.files import atomic_path, digest, file_digest, read_json, write_text
 from jaxsr.metrics import available
-from jaxsr.progress import Advance
-from jaxsr.provenance import device, versions
-from jaxsr.report.results import MethodResult, Timing
+from jaxsr.provenance import device, machine, versions
+from jaxsr.report.results import MethodResult
 from jaxsr.report.tables import json_value
-from jaxsr.runtime.cost import Cost
+from jaxsr.runtime.cost import Cost, Timing
 from jaxsr.runtime.load import LoadedMethod
+from jaxsr.runtime.record import claim_folder, describe_run, frame_path, read_run
 
 RECORD = "result.json"
-FOLDERS = ("exr", "png", "flip")
-NOT_CODE = ("cli.py", "training", "data", "report/page.py", "report/tables.py")
+FORMAT = "jaxsr-result"
+KINDS = ("exr", "png", "flip")
+NOT_CODE = ("cli.py", "training", "data", "inspection", "blender", "report/page.py", "report/tables.py")
 """Of the package, what results do not depend on; who edits a method wants new ones."""
 
 
-def run_kept(
-    sequence: FrameSequence,
-    ready: LoadedMethod,
-    out: Path,
-    settings: Settings,
-    reference: Reference,
-    advance: Advance = lambda: None,
-) -> MethodResult:
-    """`run_method`, or what it gave when it was last run with the same settings on the same files."""
-    key = _key(sequence, ready, settings, reference)
-    measured = sequence.infos[settings.warmup :]
-    images = [png_file(out, info.index) for info in measured]
-    flips = [out / "flip" / f"{info.index:04d}.jpg" for info in measured]
-    track = _load(out / RECORD, key, images, flips)
-    if track is not None:
+def run_kept(evaluation: Evaluation, loaded: LoadedMethod, out: Path) -> MethodResult:
+    """`run_method`, or what it gave when it was last run with the same settings, code and files.
+
+    Warns:
+        UserWarning: the code of the method cannot be told from other code; its results are not kept.
+
+    Raises:
+        JaxsrError: as `run_method`; a file result.json that jaxsr did not write.
+    """
+    sequence, settings = evaluation.sequence, evaluation.settings
+    key = _key(evaluation, loaded)
+    measured = [info.index for info in sequence.infos[settings.warmup :]]
+    images = [frame_path(out, "png", index) for index in measured]
+    flips = [frame_path(out, "flip", index) for index in measured]
+    _check_record(out / RECORD)
+    kept = _load(out / RECORD, key, images, flips) if key is not None else None
+    if kept is not None:
         for _ in range(2 * len(sequence)):
-            advance()
-        return track
-    if (out / RECORD).is_file():  # ours, hence also what lies beside it
-        for name in FOLDERS:
-            shutil.rmtree(out / name, ignore_errors=True)
-    check_folder(out, {info.index for info in sequence.infos})
-    _write(out / RECORD, {"key": key})
-    track = run_method(sequence, ready, out, settings, reference, advance)
-    for file, flip in zip(flips, track.flip_maps, strict=True):
+            evaluation.advance()
+        return kept
+    name = loaded.method.name
+    run = describe_run(sequence, settings.scale, settings.every, name, loaded.weights)
+    claim_folder(out, run, KINDS, replace=True)
+    _write(out / RECORD, key)
+    result = run_method(evaluation, loaded, out)
+    for file, flip in zip(flips, result.flip_maps, strict=True):
         with atomic_path(file) as temporary:
             temporary.write_bytes(flip)
-    _write(out / RECORD, {"key": key, "track": _as_json(track)})
-    return track
+    _write(out / RECORD, key, result)
+    return result
 
 
-def _key(
-    sequence: FrameSequence, ready: LoadedMethod, settings: Settings, reference: Reference
-) -> dict[str, Any]:
+def _key(evaluation: Evaluation, loaded: LoadedMethod) -> dict[str, Any] | None:
+    """All that a result depends on; None if that cannot be told."""
+    sequence, settings = evaluation.sequence, evaluation.settings
+    try:
+        method = method_digest((loaded.method, None if loaded.weights else loaded.net))
+    except UnknownCodeError as error:
+        warnings.warn(
+            f"results of {loaded.method.name!r} are not kept, because its code holds {error}", stacklevel=2
+        )
+        return None
     files = [file for name in sequence.resolutions for file in sorted((sequence.path / name).iterdir())]
     stats = [(file.parent.name, file.name, file.stat()) for file in files]
     listing = [f"{folder}/{name} {stat.st_size} {stat.st_mtime_ns}" for folder, name, stat in stats]
@@ -73,45 +86,64 @@ def _key(
     code = [file for name, file in names if not name.startswith(NOT_CODE)]
     return {
         "jaxsr": jaxsr.__version__,
+        "python": platform.python_version(),
         "packages": versions(),
         "device": device(),
+        "cpu": machine(),
         "code": digest(file.read_bytes() for file in code),
-        "method": ready.method.name,
-        "weights": None if ready.weights is None else digest([ready.weights.read_bytes()]),
+        "method": loaded.method.name,
+        "method_code": method,
+        "weights": None if loaded.weights is None else file_digest(loaded.weights),
         "sequence": digest([(sequence.path / "sequence.json").read_bytes(), *(s.encode() for s in listing)]),
         "frames": [info.index for info in sequence.infos],
         "settings": settings._replace(metrics=settings.metrics or available())._asdict(),
-        "regions": reference.in_regions,
+        "regions": evaluation.reference.in_regions,
     }
 
 
-def _as_json(track: MethodResult) -> dict[str, Any]:
+def _as_json(result: MethodResult) -> dict[str, Any]:
     return {
-        "name": track.name,
-        "note": track.note,
-        "timing": vars(track.timing) if track.timing else None,
-        "cost": vars(track.cost) if track.cost else None,
-        "metrics": track.metrics,
-        "regions": track.regions,
+        "name": result.name,
+        "note": result.note,
+        "timing": vars(result.timing) if result.timing else None,
+        "cost": vars(result.cost) if result.cost else None,
+        "metrics": result.metrics,
+        "regions": result.regions,
     }
+
+
+def _check_record(path: Path) -> None:
+    """See that a file result.json is jaxsr's, or a damaged one beside frames of jaxsr.
+
+    Raises:
+        JaxsrError: it is of another program.
+    """
+    if not path.exists():
+        return
+    try:
+        ours = read_json(path, dict).get("format") == FORMAT
+    except JaxsrError:
+        ours = path.is_file() and read_run(path.parent) is not None
+    if not ours:
+        raise JaxsrError("not a result of jaxsr", where=path, fix="choose another folder with --out")
 
 
 def _load(record: Path, key: Mapping[str, Any], images: list[Path], flips: list[Path]) -> MethodResult | None:
-    """The track of a record, if it is finished, has this key, and its pictures are there."""
+    """The result of a record, if it is finished, has this key, and its pictures are there."""
     try:
-        found = json.loads(record.read_text(encoding="utf-8"))
-        if found["key"] != json.loads(json.dumps(json_value(key))) or not all(p.is_file() for p in images):
+        read = json.loads(record.read_text(encoding="utf-8"))
+        if read["key"] != json.loads(json.dumps(json_value(key))) or not all(p.is_file() for p in images):
             return None
-        track = found["track"]
+        result = read["result"]
         return MethodResult(
-            track["name"],
+            result["name"],
             images,
-            _numbers(track["metrics"]),
-            Timing(**track["timing"]) if track["timing"] else None,
-            track["note"],
+            _numbers(result["metrics"]),
+            Timing(**result["timing"]) if result["timing"] else None,
+            result["note"],
             [file.read_bytes() for file in flips],
-            {region: _numbers(values) for region, values in track["regions"].items()},
-            Cost(**track["cost"]) if track["cost"] else None,
+            {region: _numbers(values) for region, values in result["regions"].items()},
+            Cost(**result["cost"]) if result["cost"] else None,
         )
     except (OSError, ValueError, KeyError, TypeError):  # not there, unfinished or damaged
         return None
@@ -121,6 +153,6 @@ def _numbers(metrics: Mapping[str, list[Any]]) -> dict[str, list[float | None]]:
     return {key: [math.inf if v == "inf" else v for v in values] for key, values in metrics.items()}
 
 
-def _write(path: Path, value: Any) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_text(json.dumps(json_value(value), indent=1) + "\n", encoding="utf-8")
+def _write(path: Path, key: Mapping[str, Any] | None, result: MethodResult | None = None) -> None:
+    record = {"format": FORMAT, "key": key, "result": None if result is None else _as_json(result)}
+    write_text(path, json.dumps(json_value(record), indent=1) + "\n")

@@ -10,18 +10,13 @@ import numpy as np
 from jaxsr.evaluation.regions import regions
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.metrics import available, flip_map, measure_frame
-from jaxsr.ops import to_display
 from jaxsr.report.embedding import ImageOrPath, flip_jpeg
-from jaxsr.report.results import ALL, MethodResult, Timing
-from jaxsr.runtime.cost import Cost
+from jaxsr.report.results import ALL, MethodResult
+from jaxsr.runtime.cost import Cost, Timing
+from jaxsr.runtime.upscale import display
 
 CACHE_BYTES = 256e6
 """How much of the truth a `Reference` keeps."""
-
-
-def display(color_linear: np.ndarray, exposure: float) -> np.ndarray:
-    """The display-referred image of jaxsr: sRGB of the ACES tone map, float32 in [0, 1]."""
-    return np.asarray(to_display(np.ascontiguousarray(color_linear), exposure))
 
 
 def metrics_with(lpips: bool) -> tuple[str, ...]:
@@ -60,12 +55,12 @@ class Reference:
 
     def _read(self, i: int) -> Truth:
         sequence = self._sequence
-        found = regions(self._frame(i), self._frame(i - 1) if i else None) if self.in_regions else {}
-        return Truth(display(sequence.truth(i), sequence.exposure), found)
+        masks = regions(self._frame(i), self._frame(i - 1) if i else None) if self.in_regions else {}
+        return Truth(display(sequence.truth(i), sequence.exposure), masks)
 
 
 class Meter:
-    """Every metric of a track, frame after frame.
+    """Every metric of a method, frame after frame.
 
     Args:
         keys: the metrics; all there are by default.
@@ -73,7 +68,7 @@ class Meter:
 
     def __init__(self, keys: Collection[str] | None = None) -> None:
         self._keys = keys
-        self._found: dict[str, dict[str, list[float | None]]] = {}
+        self._values: dict[str, dict[str, list[float | None]]] = {}
         self._flip_maps: list[bytes] = []
         self._before: tuple[np.ndarray, np.ndarray] | None = None
 
@@ -89,7 +84,7 @@ class Meter:
             maps = list(pool.map(flip_map, images, (truth.image for truth in truths)))
             self._flip_maps += pool.map(flip_jpeg, maps)
         for image, truth, start, error in zip(images, truths, starts, maps, strict=True):
-            found = measure_frame(
+            measured = measure_frame(
                 image,
                 truth.image,
                 before=None if start else self._before,
@@ -97,12 +92,12 @@ class Meter:
                 flip_error=error,
                 keys=self._keys,
             )
-            for region, values in found.items():
+            for region, values in measured.items():
                 for key, value in values.items():
-                    self._found.setdefault(region, {}).setdefault(key, []).append(value)
+                    self._values.setdefault(region, {}).setdefault(key, []).append(value)
             self._before = image, truth.image
 
-    def track(
+    def result(
         self,
         name: str,
         images: Sequence[ImageOrPath],
@@ -111,9 +106,9 @@ class Meter:
         cost: Cost | None = None,
     ) -> MethodResult:
         """What was measured, as that of these images."""
-        regions = {region: values for region, values in self._found.items() if region != ALL}
+        regions = {region: values for region, values in self._values.items() if region != ALL}
         return MethodResult(
-            name, images, self._found.get(ALL, {}), timing, note, self._flip_maps, regions, cost
+            name, images, self._values.get(ALL, {}), timing, note, self._flip_maps, regions, cost
         )
 
 
@@ -126,7 +121,7 @@ def measured(
     timing: Timing | None = None,
     note: str = "",
 ) -> MethodResult:
-    """A track with every metric, of images that are in memory.
+    """A result with every metric, of images that are in memory.
 
     Args:
         images, truths: display-referred float images [H, W, 3], one pair a frame.
@@ -134,4 +129,4 @@ def measured(
     """
     meter = Meter()
     meter.add(images, [Truth(truth, {}) for truth in truths], starts or [False] * len(truths))
-    return meter.track(name, images, timing, note)
+    return meter.result(name, images, timing, note)

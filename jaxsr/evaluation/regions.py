@@ -12,30 +12,20 @@ from jaxtyping import Array, Bool
 
 from jaxsr.frames import Frame, GBuffer
 from jaxsr.ops.masks import disocclusion_mask
-
-BEND = 0.1
-
-REGIONS = {
-    "edges": "The pixels on both sides of an outline: along a row or column of the HR depth, the inverse of "
-    f"the depth is off the straight line of its two neighbours by more than {BEND:.0%} of the largest of the "
-    "three. Neither a slanted plane nor a texture, a shadow or a crease is one.",
-    "disocclusions": "What was out of sight in the frame before: holes of "
-    "jaxsr.ops.masks.disocclusion_mask between the two HR G-buffers. There are none at a cut or a start.",
-}
-"""Definitions, by name."""
+from jaxsr.report.results import BEND
 
 
 @jax.jit
 def _edges(depth: Array) -> Array:
     # 1/depth is linear over the image of a plane at any slant, and 0 for sky.
     inverse = 1 / depth[..., 0]
-    found = []
+    masks = []
     for v in (inverse, inverse.T):
         before, middle, after = v[:-2], v[1:-1], v[2:]
         largest = jnp.maximum(jnp.maximum(before, after), middle)
         bent = jnp.abs(before + after - 2 * middle) > BEND * largest
-        found.append(jnp.zeros(v.shape, bool).at[1:-1].set(bent))
-    return found[0] | found[1].T
+        masks.append(jnp.zeros(v.shape, bool).at[1:-1].set(bent))
+    return masks[0] | masks[1].T
 
 
 def edges(gbuffer: GBuffer) -> Bool[np.ndarray, "h w"]:

@@ -21,11 +21,10 @@ import numpy as np
 from matplotlib import colormaps
 
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation.regions import REGIONS
 from jaxsr.files import atomic_path
 from jaxsr.metrics import METRICS
 from jaxsr.report.embedding import Images, thinned
-from jaxsr.report.results import SequenceResult
+from jaxsr.report.results import REGIONS, SequenceResult
 from jaxsr.report.tables import Scores, groups, json_value, mean_scores, rows, scores
 
 MAX_MEGABYTES = 18.0
@@ -37,7 +36,7 @@ def _keys(names: Iterable[str]) -> list[str]:
     taken = {"truth", "input"}
     keys = []
     for name in names:
-        base = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "track"
+        base = re.sub(r"[^a-z0-9]+", "-", name.lower()).strip("-") or "method"
         key = next(k for n in range(1, 10_000) if (k := base if n == 1 else f"{base}-{n}") not in taken)
         taken.add(key)
         keys.append(key)
@@ -55,22 +54,22 @@ def _section_data(section: SequenceResult, images: Images) -> dict[str, Any]:
     if len(shapes) != 1:
         raise JaxsrError("truth frames differ in size", where=section.title, found=sorted(shapes))
     (shape,) = shapes
-    tracks = []
-    for key, track in zip(_keys(t.name for t in section.tracks), section.tracks, strict=True):
-        indices = [images.add(image, place(track.name, i)) for i, image in enumerate(track.images)]
+    results = []
+    for key, result in zip(_keys(t.name for t in section.methods), section.methods, strict=True):
+        indices = [images.add(image, place(result.name, i)) for i, image in enumerate(result.images)]
         for i, index in enumerate(indices):
             if images.shapes[index] != shape:
                 found = images.shapes[index]
-                raise JaxsrError("wrong size", where=place(track.name, i), expected=shape, found=found)
-        tracks.append(
+                raise JaxsrError("wrong size", where=place(result.name, i), expected=shape, found=found)
+        results.append(
             {
                 "key": key,
-                "name": track.name,
-                "note": track.note,
+                "name": result.name,
+                "note": result.note,
                 "images": indices,
-                "flip": list(track.flip_maps),
-                "metrics": track.metrics,
-                "regions": track.regions,
+                "flip": list(result.flip_maps),
+                "metrics": result.metrics,
+                "regions": result.regions,
             }
         )
     inputs = [
@@ -89,7 +88,7 @@ def _section_data(section: SequenceResult, images: Images) -> dict[str, Any]:
         "truth": truth,
         "input": inputs if sizes else None,
         "input_note": note,
-        "tracks": tracks,
+        "tracks": results,
         "subsets": [[name, len(where)] for name, where in section.subsets().items()],
         "regions": section.regions(),
         "task": section.task,
@@ -177,8 +176,8 @@ def _embed(payload: list[dict[str, Any]], images: Images, budget: float) -> tupl
         if shown * (size + flips) <= total * budget:
             break
     for s in payload:
-        of_tracks = [(track, key) for track in s["tracks"] for key in ("images", "flip")]
-        for holder, key in [(s, "truth"), (s, "input"), *of_tracks]:
+        of_methods = [(result, key) for result in s["tracks"] for key in ("images", "flip")]
+        for holder, key in [(s, "truth"), (s, "input"), *of_methods]:
             if holder[key]:
                 pairs = zip(holder[key], s["embedded"], strict=True)
                 holder[key] = [what if here else None for what, here in pairs]
@@ -193,10 +192,10 @@ def _embed(payload: list[dict[str, Any]], images: Images, budget: float) -> tupl
     for some in lists:
         some[:] = [None if i is None else position[i] for i in some]
     for s in payload:
-        for track in s["tracks"]:
-            for i, file in enumerate(track["flip"] or []):
+        for result in s["tracks"]:
+            for i, file in enumerate(result["flip"] or []):
                 if file is not None:
-                    track["flip"][i] = len(uris)
+                    result["flip"][i] = len(uris)
                     uris.append(_uri("jpeg", file))
     if shown < total:
         about += f"; {shown} of {total} frames have images here, all have numbers"
@@ -216,7 +215,7 @@ def write_report(
 
     Args:
         path: the file to write; replaced atomically.
-        sections: what to show; images display-referred in [0, 1], truth and tracks of one size a section.
+        sections: what to show; images display-referred in [0, 1], of one size in each section.
         title: heading and window title.
         meta: device, versions, commit, date, settings; shown as given, nested mappings flattened.
         fps: speed at which the page plays at first.

@@ -12,24 +12,22 @@ from typing import Any, TypeAlias
 from jaxsr.errors import JaxsrError
 from jaxsr.metrics import METRICS
 from jaxsr.report.embedding import ImageOrPath
-from jaxsr.runtime.cost import Cost
+from jaxsr.runtime.cost import Cost, Timing
 
 Values: TypeAlias = Sequence[float | None]
 
 ALL = "all"
 """The name of the region that is the whole image."""
+BEND = 0.1
 
-
-@dataclass(frozen=True)
-class Timing:
-    """Time of one frame. Compilation happens once and is never part of the median."""
-
-    compile_s: float
-    """Seconds of compilation alone, before the first call."""
-    median_ms: float
-    """Median time of one frame in milliseconds."""
-    spread_ms: float
-    """Interquartile range of the time of one frame in milliseconds."""
+REGIONS = {
+    "edges": "The pixels on both sides of an outline: along a row or column of the HR depth, the inverse of "
+    f"the depth is off the straight line of its two neighbours by more than {BEND:.0%} of the largest of the "
+    "three. Neither a slanted plane nor a texture, a shadow or a crease is one.",
+    "disocclusions": "What was out of sight in the frame before: holes of "
+    "jaxsr.ops.masks.disocclusion_mask between the two HR G-buffers. There are none at a cut or a start.",
+}
+"""Definitions of the regions that results are measured on (`jaxsr.evaluation.regions`), by name."""
 
 
 @dataclass(frozen=True)
@@ -61,7 +59,7 @@ class SequenceResult:
     frames: Sequence[int]
     """Numbers of the frames, as files and people name them."""
     truths: Sequence[ImageOrPath]
-    tracks: Sequence[MethodResult]
+    methods: Sequence[MethodResult]
     inputs: Sequence[ImageOrPath | None] = ()
     """What the methods were given, at its own size; None for a frame that was not rendered."""
     extrapolated: Sequence[bool] = ()
@@ -75,24 +73,24 @@ class SequenceResult:
         n = len(self.frames)
         if n == 0:
             raise JaxsrError("no frames", where=self.title)
-        if not self.tracks:
-            raise JaxsrError("no tracks", where=self.title)
-        names = [t.name for t in self.tracks]
+        if not self.methods:
+            raise JaxsrError("no methods", where=self.title)
+        names = [t.name for t in self.methods]
         if len(set(names)) != len(names):
-            raise JaxsrError("two tracks have the same name", where=self.title, found=names)
+            raise JaxsrError("two methods have the same name", where=self.title, found=names)
         counts = {"truths": len(self.truths)}
         counts |= {"inputs": len(self.inputs)} if self.inputs else {}
         counts |= {"extrapolated": len(self.extrapolated)} if self.extrapolated else {}
-        for track in self.tracks:
-            counts[f"images of {track.name}"] = len(track.images)
-            counts |= {f"FLIP maps of {track.name}": len(track.flip_maps)} if track.flip_maps else {}
-            for region in (ALL, *track.regions):
-                for key, values in track.over(region).items():
-                    counts[f"{key} of {track.name}{'' if region == ALL else ', ' + region}"] = len(values)
+        for result in self.methods:
+            counts[f"images of {result.name}"] = len(result.images)
+            counts |= {f"FLIP maps of {result.name}": len(result.flip_maps)} if result.flip_maps else {}
+            for region in (ALL, *result.regions):
+                for key, values in result.over(region).items():
+                    counts[f"{key} of {result.name}{'' if region == ALL else ', ' + region}"] = len(values)
                     if key not in METRICS:
                         raise JaxsrError(
                             f"unknown metric '{key}'",
-                            where=f"{self.title}, {track.name}",
+                            where=f"{self.title}, {result.name}",
                             expected=sorted(METRICS),
                         )
         for what, count in counts.items():
@@ -102,12 +100,12 @@ class SequenceResult:
                 )
 
     def metric_keys(self) -> list[str]:
-        """Keys of the metrics that any track has, in the order of `METRICS`."""
-        return [key for key in METRICS if any(key in track.metrics for track in self.tracks)]
+        """Keys of the metrics that any method has, in the order of `METRICS`."""
+        return [key for key in METRICS if any(key in result.metrics for result in self.methods)]
 
     def regions(self) -> list[str]:
-        """ "all", and the regions that any track was measured on."""
-        return list(dict.fromkeys([ALL, *(region for track in self.tracks for region in track.regions)]))
+        """ "all", and the regions that any method was measured on."""
+        return list(dict.fromkeys([ALL, *(region for result in self.methods for region in result.regions)]))
 
     def subsets(self) -> dict[str, list[int]]:
         """Positions of the frames to average over: "all", and "extrapolated" and "rendered" if both exist."""

@@ -25,8 +25,8 @@ from rich.table import Table
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path
 from jaxsr.metrics import METRICS
-from jaxsr.report.results import ALL, MethodResult, SequenceResult, Timing, Values
-from jaxsr.runtime.cost import Cost
+from jaxsr.report.results import ALL, MethodResult, SequenceResult, Values
+from jaxsr.runtime.cost import Cost, Timing
 
 
 @dataclass(frozen=True)
@@ -55,15 +55,15 @@ def summarise(values: Values) -> Summary:
     return Summary(mean, spread, len(finite), identical)
 
 
-def summary(track: MethodResult, key: str, positions: Sequence[int], region: str = ALL) -> Summary:
-    """`summarise` of metric `key` of a track at some positions; nothing defined if the track lacks it."""
-    values = track.over(region).get(key)
+def summary(result: MethodResult, key: str, positions: Sequence[int], region: str = ALL) -> Summary:
+    """`summarise` of metric `key` of a method at some positions; nothing defined if the method lacks it."""
+    values = result.over(region).get(key)
     return summarise([] if values is None else [values[i] for i in positions])
 
 
 def best(section: SequenceResult, key: str, positions: Sequence[int], region: str = ALL) -> set[str]:
-    """Names of the tracks with the best mean, as far as the shown digits tell them apart."""
-    return _winners({t.name: summary(t, key, positions, region).mean for t in section.tracks}, key)
+    """Names of the methods with the best mean, as far as the shown digits tell them apart."""
+    return _winners({t.name: summary(t, key, positions, region).mean for t in section.methods}, key)
 
 
 def _winners(means: Mapping[str, float | None], key: str) -> set[str]:
@@ -106,7 +106,7 @@ def scores(section: SequenceResult, subset: str, region: str = ALL) -> Scores:
     positions, keys = section.subsets()[subset], section.metric_keys()
     lines = [
         Line(t.name, t.note, {k: summary(t, k, positions, region) for k in keys}, t.timing, t.cost)
-        for t in section.tracks
+        for t in section.methods
     ]
     count = f"{len(positions)} frame{'s' if len(positions) != 1 else ''}"
     return Scores(section.title, subset, region, count, keys, lines)
@@ -303,26 +303,26 @@ def as_json(
     out = []
     for section in sections:
         subsets = section.subsets()
-        tracks = []
-        for track in section.tracks:
+        results = []
+        for result in section.methods:
 
-            def summaries(region: str, track: MethodResult = track) -> dict[str, Any]:
+            def summaries(region: str, result: MethodResult = result) -> dict[str, Any]:
                 return {
-                    name: {k: vars(summary(track, k, where, region)) for k in track.over(region)}
+                    name: {k: vars(summary(result, k, where, region)) for k in result.over(region)}
                     for name, where in subsets.items()  # noqa: B023 (called before the next turn)
                 }
 
-            tracks.append(
+            results.append(
                 {
-                    "name": track.name,
-                    "note": track.note,
-                    "timing": vars(track.timing) if track.timing else None,
-                    "cost": vars(track.cost) if track.cost else None,
-                    "metrics": track.metrics,
+                    "name": result.name,
+                    "note": result.note,
+                    "timing": vars(result.timing) if result.timing else None,
+                    "cost": vars(result.cost) if result.cost else None,
+                    "metrics": result.metrics,
                     "summary": summaries(ALL),
                     "regions": {
-                        region: {"metrics": track.over(region), "summary": summaries(region)}
-                        for region in track.regions
+                        region: {"metrics": result.over(region), "summary": summaries(region)}
+                        for region in result.regions
                     },
                 }
             )
@@ -334,7 +334,7 @@ def as_json(
                 "extrapolated": list(section.extrapolated) or [False] * len(section.frames),
                 "exposure": section.exposure,
                 "meta": section.meta,
-                "tracks": tracks,
+                "tracks": results,
             }
         )
     means = [
@@ -373,13 +373,13 @@ def as_csv(sections: Sequence[SequenceResult]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(["section", "method", "frame", "extrapolated", "pixels", *keys])
     for section in sections:
-        for track in section.tracks:
+        for result in section.methods:
             for i, frame in enumerate(section.frames):
                 flag = int(bool(section.extrapolated and section.extrapolated[i]))
-                for region in (ALL, *track.regions):
-                    values = [track.over(region)[k][i] if k in track.over(region) else None for k in keys]
+                for region in (ALL, *result.regions):
+                    values = [result.over(region)[k][i] if k in result.over(region) else None for k in keys]
                     shown = ["" if v is None else repr(float(v)) for v in values]
-                    writer.writerow([section.title, track.name, frame, flag, region, *shown])
+                    writer.writerow([section.title, result.name, frame, flag, region, *shown])
     return text.getvalue()
 
 

@@ -1,4 +1,4 @@
-"""What a network costs, whatever it runs on: parameters, and multiply-adds counted from the program itself.
+"""What a method costs: parameters, multiply-adds counted from the program itself, and the time of a frame.
 
 Only convolutions and matrix products count: what papers' tables hold, and what a network spends its time on.
 Filters and gathers, as of the methods without a network, are written in other operations and count nothing.
@@ -24,6 +24,18 @@ class Cost:
     """Numbers that are learned; running averages of batch norm are not."""
     multiply_adds_per_px: float
     """Of convolutions and matrix products for one frame, divided by the number of its HR pixels."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Time of one frame. Compilation happens once and is never part of the median."""
+
+    compile_s: float
+    """Seconds of compilation alone, before the first call."""
+    median_ms: float
+    """Median time of one frame in milliseconds."""
+    spread_ms: float
+    """Interquartile range of the time of one frame in milliseconds."""
 
 
 def count_parameters(net: Any) -> int:

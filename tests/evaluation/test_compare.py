@@ -53,7 +53,7 @@ def test_end_to_end(folders):
         progress=lambda title, total: steps.append((title, total)) or (lambda: steps.append(1)),
     )
     assert steps == [("measuring", 6), *[1] * 6]
-    exact, bright = section.tracks
+    exact, bright = section.methods
     assert (exact.name, bright.name) == ("exact", "bright")
     assert section.frames == (1, 2, 3)
     assert exact.metrics["psnr"] == [math.inf] * 3
@@ -82,7 +82,7 @@ def test_linear_frames_go_through_the_tone_map(tmp_path, kind):
     write_folder(tmp_path / "a", offset=0.2, kind=kind)
     section = compare([tmp_path / "a"], tmp_path / "truth", tmp_path / "out", exposure=2.0)
     images = [np.asarray(to_display(frame(1, offset), 2.0)) for offset in (0.2, 0.0)]
-    assert section.tracks[0].metrics["psnr"][0] == pytest.approx(metrics.psnr(*images), abs=1e-3)
+    assert section.methods[0].metrics["psnr"][0] == pytest.approx(metrics.psnr(*images), abs=1e-3)
     assert section.exposure == 2.0
     # What the page embeds is the same image, 8 bits.
     assert np.abs(read_png(section.truths[0]) - images[1]).max() <= 0.5 / 255 + 1e-6
@@ -105,25 +105,25 @@ def test_a_sequence_brings_its_exposure_and_its_cuts(tmp_path):
     write_folder(tmp_path / "a", offset=0.1, kind="exr")
     section = compare([tmp_path / "a"], tmp_path / "truth", tmp_path / "out")
     assert section.exposure == 0.5
-    assert [v is None for v in section.tracks[0].metrics["tpsnr"]] == [True, False, True]
+    assert [v is None for v in section.methods[0].metrics["tpsnr"]] == [True, False, True]
 
 
 def test_matching_by_number_by_name_and_with_gaps(folders):
     write_folder(folders / "other", name="render_v2.{}")  # the last number counts
     section = compare([folders / "other"], folders / "truth", folders / "out")
-    assert section.tracks[0].metrics["psnr"] == [math.inf] * 3
+    assert section.methods[0].metrics["psnr"] == [math.inf] * 3
     for name in ("t", "a"):
         write_folder(folders / name, numbers=(1, 2, 10, 11), name="f{}")  # f10 sorts before f2
     section = compare([folders / "a"], folders / "t", folders / "out2")
     assert section.frames == (1, 2, 10, 11)
-    assert [v is None for v in section.tracks[0].metrics["tpsnr"]] == [True, False, True, False]
+    assert [v is None for v in section.methods[0].metrics["tpsnr"]] == [True, False, True, False]
     for name in ("left", "right"):
         (folders / name).mkdir()
         for word, i in (("ant", 1), ("bee", 2)):
             write_png(folders / name / f"{word}.png", frame(i))
     section = compare([folders / "left"], folders / "right", folders / "out3")
     assert section.frames == (1, 2)
-    assert section.tracks[0].metrics["psnr"] == [math.inf] * 2
+    assert section.methods[0].metrics["psnr"] == [math.inf] * 2
 
 
 def test_what_upscale_writes_is_found(folders):
@@ -132,7 +132,7 @@ def test_what_upscale_writes_is_found(folders):
     assert find_frames(folders / "method", "png").files[0].suffix == ".png"
     assert find_frames(folders / "method", "exr").files[0].suffix == ".exr"
     section = compare([folders / "method"], folders / "truth", folders / "out")
-    assert section.tracks[0].metrics["psnr"] == [math.inf] * 3
+    assert section.methods[0].metrics["psnr"] == [math.inf] * 3
 
 
 def test_labels(tmp_path):

@@ -1,24 +1,34 @@
 """`jaxsr evaluate` end to end: numbers as on disk, the truth unseen, runs that go on; and every refusal."""
 
 import csv
+import dataclasses
+import functools
 import json
+import os
 import shutil
+import subprocess
+import sys
+import threading
+import types
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from jaxsr import metrics
 from jaxsr.errors import JaxsrError
-from jaxsr.evaluation import evaluate as evaluation
-from jaxsr.evaluation import running as upscale
-from jaxsr.evaluation.evaluate import evaluate, find_methods
-from jaxsr.evaluation.regions import REGIONS, regions
-from jaxsr.evaluation.running import Settings
+from jaxsr.evaluation.code import method_digest
+from jaxsr.evaluation.evaluate import evaluate, find_methods, part
+from jaxsr.evaluation.measuring import Reference
+from jaxsr.evaluation.regions import regions
+from jaxsr.evaluation.running import Evaluation, Settings, run_method
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.images import read_png
 from jaxsr.methods import METHODS
+from jaxsr.report.results import REGIONS
 from jaxsr.report.tables import rich_tables
+from jaxsr.runtime import upscale
 from jaxsr.runtime.load import find_method, shipped_scales
 from jaxsr.weights.file import load_weights, save_weights
 from tests.builders import make_sequence, random_weights
@@ -90,7 +100,7 @@ def test_it_writes_frames_numbers_and_a_page(done):
 def test_numbers_are_those_of_the_frames_on_disk(done, data):
     out, sections, _ = done
     opened = upscale.FrameSequence.open(data / "set" / "two")
-    track, i = sections[1].tracks[1], 2
+    result, i = sections[1].methods[1], 2
     pairs = [
         tuple(read_png(out / "two" / place / "png" / f"{n:04d}.png") for place in ("net", "truth"))
         for n in (2, 3)
@@ -102,7 +112,7 @@ def test_numbers_are_those_of_the_frames_on_disk(done, data):
     for region, values in found.items():
         for key, value in values.items():
             # The PNGs are rounded to 8 bits.
-            assert track.over(region)[key][i] == pytest.approx(value, rel=0.01)
+            assert result.over(region)[key][i] == pytest.approx(value, rel=0.01)
 
 
 def test_the_mean_over_sequences_is_that_of_their_means(done):
@@ -110,10 +120,10 @@ def test_the_mean_over_sequences_is_that_of_their_means(done):
     means = json.loads((out / "metrics.json").read_text())["means"]
     assert [m["region"] for m in means] == ["all", *REGIONS]
     for one in means:
-        for k, track in enumerate(one["tracks"]):
-            for key, found in track["summary"].items():
+        for k, result in enumerate(one["tracks"]):
+            for key, found in result["summary"].items():
                 values = [
-                    [v for v in s.tracks[k].over(one["region"])[key] if v is not None] for s in sections
+                    [v for v in s.methods[k].over(one["region"])[key] if v is not None] for s in sections
                 ]
                 each = [np.mean(v) for v in values]
                 assert found["mean"] == pytest.approx(np.mean(each), rel=1e-9)
@@ -135,7 +145,7 @@ def test_the_truth_is_never_seen(done, data, tmp_path):
     methods = ["guided", str(data / "net.safetensors")]
     sections = run([clean, poisoned], methods, tmp_path / "out", SETTINGS._replace(every=2))
     assert list(sections[0].extrapolated) == [False, True, False, True]
-    assert sections[0].tracks[0].metrics["psnr"] != sections[1].tracks[0].metrics["psnr"]
+    assert sections[0].methods[0].metrics["psnr"] != sections[1].methods[0].metrics["psnr"]
     for method in ("guided", "net"):
         files = sorted((tmp_path / "out" / "clean" / method / "exr").iterdir())
         assert len(files) == 4
@@ -158,7 +168,7 @@ def counted(monkeypatch):
 
 
 def numbers(sections):
-    return [[(t.metrics, t.regions, t.cost, t.flip_maps) for t in s.tracks] for s in sections]
+    return [[(t.metrics, t.regions, t.cost, t.flip_maps) for t in s.methods] for s in sections]
 
 
 def test_what_is_finished_is_kept(done, data, tmp_path, counted):
@@ -171,13 +181,13 @@ def test_what_is_finished_is_kept(done, data, tmp_path, counted):
     )
     assert counted == []
     assert numbers(again) == numbers(done[1])
-    assert [t.timing for s in again for t in s.tracks] == [t.timing for s in done[1] for t in s.tracks]
+    assert [t.timing for s in again for t in s.methods] == [t.timing for s in done[1] for t in s.methods]
     assert steps.count(("frames", 2 * 2 * 7)) == 2 * 2 * 7  # the bar is full
 
     # One more method, and a damaged, an unfinished and an outdated record.
     (out / "one" / "bilinear" / "result.json").write_text("{")
     record = out / "two" / "bilinear" / "result.json"
-    record.write_text(json.dumps({"key": json.loads(record.read_text())["key"]}))
+    record.write_text(json.dumps(json.loads(record.read_text()) | {"result": None}))
     (out / "one" / "net" / "png" / "0002.png").unlink()
     again = run([data / "set"], ["nearest", *methods], out)
     assert counted == ["nearest", "bilinear", "net", "nearest", "bilinear"]
@@ -230,9 +240,9 @@ def test_warm_up_is_made_and_not_measured(data, tmp_path):
     assert rest.frames == whole.frames[2:]
     for region in ("all", *REGIONS):
         for key in KEYS:
-            assert rest.tracks[0].over(region)[key][1:] == whole.tracks[0].over(region)[key][3:]
-    assert rest.tracks[0].metrics["psnr"] == whole.tracks[0].metrics["psnr"][2:]
-    assert rest.tracks[0].metrics["tpsnr"][0] is None
+            assert rest.methods[0].over(region)[key][1:] == whole.methods[0].over(region)[key][3:]
+    assert rest.methods[0].metrics["psnr"] == whole.methods[0].metrics["psnr"][2:]
+    assert rest.methods[0].metrics["tpsnr"][0] is None
     assert len(list((tmp_path / "b" / "two" / "taau" / "png").iterdir())) == 4
 
 
@@ -240,8 +250,8 @@ def test_warm_up_is_made_and_not_measured(data, tmp_path):
 def test_lpips_is_one_of_the_metrics(data, tmp_path):
     (section,) = run([data / "set" / "one"], ["nearest"], tmp_path / "a", Settings(2), frames=(2, 2))
     assert section.metric_keys() == list(metrics.METRICS)
-    assert section.tracks[0].metrics["lpips"][0] > 0
-    assert section.tracks[0].regions["edges"]["lpips"][0] > 0
+    assert section.methods[0].metrics["lpips"][0] > 0
+    assert section.methods[0].regions["edges"]["lpips"][0] > 0
 
 
 def test_methods_are_found(data, tmp_path, monkeypatch):
@@ -350,13 +360,151 @@ def test_other_refusals(data, tmp_path):
         run([data / "set" / "one"], ["nearest"], tmp_path / "file")
     (tmp_path / "out" / "one" / "nearest" / "png").mkdir(parents=True)
     (tmp_path / "out" / "one" / "nearest" / "png" / "0009.png").write_text("x")
-    with pytest.raises(JaxsrError, match=r"holds 0009.png, which is not a frame of this sequence"):
+    with pytest.raises(JaxsrError, match=r"holds 0009.png, which no run.json of jaxsr names"):
         run([data / "set" / "one"], ["nearest"], tmp_path / "out")
 
 
 def test_a_range_begins_anew(data):
     sequence = upscale.FrameSequence.open(data / "set" / "two")
-    cut = evaluation.part(sequence, (2, 3))
+    cut = part(sequence, (2, 3))
     assert [(info.index, info.reset) for info in cut.infos] == [(2, True), (3, False)]
     assert not sequence.infos[1].reset
     assert cut.infos[1] is sequence.infos[2]
+
+
+def test_temporal_psnr_does_not_reach_across_a_cut(data, tmp_path):
+    sequence = upscale.FrameSequence.open(data / "set" / "two")
+    sequence.infos[2] = dataclasses.replace(sequence.infos[2], reset=True)
+    evaluation = Evaluation(sequence, SETTINGS._replace(metrics=("psnr", "tpsnr")), Reference(sequence))
+    result = run_method(evaluation, find_method("nearest", 2), tmp_path / "out")
+    assert [v is None for v in result.metrics["tpsnr"]] == [True, False, True, False]
+
+
+def files_of(folder):
+    return {p: p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+@pytest.mark.parametrize("record", ['{"mine": 1}', '{"key": {}, "track": {}}', "{"])
+def test_files_of_others_are_not_touched(data, tmp_path, record):
+    folder = tmp_path / "out" / "one" / "nearest"
+    for name in ("exr/9999.exr", "png/mine.txt", "flip/notes.txt"):
+        (folder / name).parent.mkdir(parents=True)
+        (folder / name).write_text("mine")
+    (folder / "result.json").write_text(record)
+    before = files_of(folder)
+    with pytest.raises(JaxsrError, match=r"result.json: not a result of jaxsr"):
+        run([data / "set" / "one"], ["nearest"], tmp_path / "out")
+    assert files_of(folder) == before
+    (folder / "result.json").unlink()
+    before = files_of(folder)
+    with pytest.raises(JaxsrError, match=r"exr: holds 9999.exr"):
+        run([data / "set" / "one"], ["nearest"], tmp_path / "out")
+    assert files_of(folder) == before
+
+
+def test_what_was_added_beside_results_is_not_deleted(data, tmp_path):
+    run([data / "set" / "two"], ["nearest"], tmp_path / "out")
+    note = tmp_path / "out" / "two" / "nearest" / "flip" / "note.txt"
+    note.write_text("mine")
+    before = files_of(note.parents[1])
+    with pytest.raises(JaxsrError, match=r"flip: holds note.txt"):
+        run([data / "set" / "two"], ["nearest"], tmp_path / "out", frames=(2, 3))
+    assert files_of(note.parents[1]) == before
+
+
+SCRIPT = """
+import jax.numpy as jnp
+from jaxsr.methods import METHODS
+
+def step(net, state, frame):
+    state, image = METHODS["nearest"].step(net, state, frame)
+    return state, image * GAIN
+
+GAIN = {gain}
+"""
+
+
+def mine(monkeypatch, path, gain, closed=1.0):
+    """A method in a script of the user's, as `python script.py` would make it."""
+    path.write_text(SCRIPT.format(gain=gain))
+    module = types.ModuleType("my_script")
+    module.__file__ = str(path)
+    exec(compile(path.read_text(), path, "exec"), module.__dict__)
+    monkeypatch.setitem(sys.modules, "my_script", module)
+
+    def step(net, state, frame):
+        state, image = module.step(net, state, frame)
+        return state, image * closed
+
+    monkeypatch.setitem(METHODS, "mine", METHODS["nearest"]._replace(name="mine", step=step))
+
+
+def test_the_code_of_a_method_of_ones_own_counts(data, tmp_path, monkeypatch, counted):
+    def psnr(*arguments):
+        mine(monkeypatch, tmp_path / "script.py", *arguments)
+        (section,) = run(
+            [data / "set" / "one"], ["mine"], tmp_path / "out", SETTINGS._replace(metrics=("psnr",))
+        )
+        return section.methods[0].metrics["psnr"]
+
+    bright = psnr(1.0)
+    assert psnr(1.0) == bright
+    assert counted == ["mine"]  # unchanged: kept
+    assert psnr(0.25) != bright
+    assert psnr(1.0, 0.5) != bright  # a closure holds another value
+    assert psnr(1.0) == bright
+    assert counted == ["mine"] * 4
+
+
+def test_a_method_whose_content_is_unknown_is_not_kept(data, tmp_path, monkeypatch, counted):
+    lock = threading.Lock()
+
+    def step(net, state, frame):
+        with lock:
+            return METHODS["nearest"].step(net, state, frame)
+
+    monkeypatch.setitem(METHODS, "mine", METHODS["nearest"]._replace(name="mine", step=step))
+    for _ in range(2):
+        with pytest.warns(UserWarning, match=r"results of 'mine' are not kept.*_thread.lock"):
+            run([data / "set" / "one"], ["mine"], tmp_path / "out", SETTINGS._replace(metrics=("psnr",)))
+    assert counted == ["mine"] * 2
+
+
+def test_digests_of_methods_are_stable_and_their_own():
+    code = "from jaxsr.methods import METHODS\nfrom jaxsr.evaluation.code import method_digest\n" + (
+        "print(*(method_digest(method) for method in METHODS.values()))"
+    )
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            text=True,
+            check=True,
+            env=os.environ | {"PYTHONHASHSEED": seed},
+        ).stdout.split()
+        for seed in ("1", "2")
+    ]
+    assert runs[0] == runs[1]
+    assert len(set(runs[0])) == len(METHODS)
+
+
+def test_digests_see_what_functions_hold():
+    def made(value):
+        return lambda x: x + value
+
+    class Options:
+        def __init__(self, weight):
+            self.weight = weight
+
+    values = [
+        1, 1.0, "1", (1,), [1], {"a": 1}, {"b": 1}, np.ones(2), np.zeros(2), np.zeros(3), jax.numpy.ones(2),
+        frozenset({1, 2}), frozenset({1, 3}), Options(1), Options(2), made(1), made(2), np.dtype("int8"),
+        functools.partial(made, 1), functools.partial(made, 2), jax.jit(made(1)), jax.jit(made(3)), Options,
+    ]  # fmt: skip
+    digests = [method_digest(made(value)) for value in values]
+    assert len(set(digests)) == len(values)
+    assert digests == [method_digest(made(value)) for value in values]
+    first, second = {"__name__": "__main__"}, {"__name__": "__main__"}
+    exec("def f(x): return x + 1", first)  # as in a notebook: no file
+    exec("def f(x): return x + 2", second)
+    assert method_digest(first["f"]) != method_digest(second["f"])

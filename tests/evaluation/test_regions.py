@@ -7,8 +7,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from jaxsr.data import analytic
-from jaxsr.evaluation.regions import BEND, REGIONS, disocclusions, edges, regions
+from jaxsr.evaluation.regions import disocclusions, edges, regions
 from jaxsr.frames import GBuffer
+from jaxsr.report.results import BEND, REGIONS
 
 
 def of_depth(depth):

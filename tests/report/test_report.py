@@ -146,13 +146,13 @@ def test_page_holds_all_numbers(page, made):
     for given, section in zip(made, data["sections"], strict=True):
         assert section["title"] == given.title
         assert section["frames"] == list(given.frames)
-        for track, found in zip(given.tracks, section["tracks"], strict=True):
-            assert found["name"] == track.name
-            for key, values in track.metrics.items():
+        for result, found in zip(given.methods, section["tracks"], strict=True):
+            assert found["name"] == result.name
+            for key, values in result.metrics.items():
                 back = [math.inf if v == "inf" else v for v in found["metrics"][key]]
                 assert back == values
     text = re.sub(r"<[^>]+>", "", page[: page.index('id="data"')])
-    far = summary(made[0].tracks[1], "psnr", range(N))
+    far = summary(made[0].methods[1], "psnr", range(N))
     assert f"{far.mean:.2f}" in text
     for words in (
         "12.3 ± 0.50",
@@ -174,8 +174,8 @@ def test_images_come_back_without_loss_and_once(page, made):
         for i in range(N):
             truth = np.rint(255 * given.truths[i]).astype(np.uint8)
             assert np.array_equal(decoded(data["images"][section["truth"][i]]), truth)
-            for track, found in zip(given.tracks, section["tracks"], strict=True):
-                image = np.rint(255 * track.images[i]).astype(np.uint8)
+            for result, found in zip(given.methods, section["tracks"], strict=True):
+                image = np.rint(255 * result.images[i]).astype(np.uint8)
                 assert np.array_equal(decoded(data["images"][found["images"][i]]), image)
     first, second = data["sections"]
     assert first["truth"] == second["truth"]
@@ -185,16 +185,16 @@ def test_images_come_back_without_loss_and_once(page, made):
     assert first["size"] == [W, H]
     assert first["input_note"] == f"{W // 2}×{H // 2}, pixels enlarged"
     flip = decoded(data["images"][first["tracks"][1]["flip"][0]])
-    assert flip.mean() / 255 == pytest.approx(made[0].tracks[1].metrics["flip"][0], abs=0.02)
+    assert flip.mean() / 255 == pytest.approx(made[0].methods[1].metrics["flip"][0], abs=0.02)
     assert len(data["colormap"]) == 6 * 256
 
 
 def test_a_small_budget_costs_quality_then_frames(made, tmp_path):
     rng = np.random.default_rng(0)
     truths = [rng.random((64, 64, 3)).astype(np.float32) for _ in range(8)]
-    track = MethodResult("noise", [1 - t for t in truths], {"psnr": [10.0] * 8})
+    result = MethodResult("noise", [1 - t for t in truths], {"psnr": [10.0] * 8})
     section = SequenceResult(
-        "s", list(range(8)), truths, [track], extrapolated=[bool(i % 2) for i in range(8)]
+        "s", list(range(8)), truths, [result], extrapolated=[bool(i % 2) for i in range(8)]
     )
     sizes, names = [], []
     for megabytes in (1.0, 0.2, 0.12, 0.05):
@@ -237,20 +237,20 @@ def test_paths_and_arrays_make_the_same_page(tmp_path):
 
 
 def test_bad_sections_and_images(made, tmp_path):
-    truths, track = made[0].truths, made[0].tracks[0]
+    truths, result = made[0].truths, made[0].methods[0]
 
     def section(**changes):
-        given = {"title": "s", "frames": [1, 2, 3, 4], "truths": truths, "tracks": [track]}
+        given = {"title": "s", "frames": [1, 2, 3, 4], "truths": truths, "methods": [result]}
         return SequenceResult(**{**given, **changes})
 
     for words, changes in {
         "no frames": {"frames": []},
-        "no tracks": {"tracks": []},
-        "two tracks have the same name": {"tracks": [track, track]},
+        "no methods": {"methods": []},
+        "two methods have the same name": {"methods": [result, result]},
         r"truths: wrong number; expected 4 \(frames\); found 3": {"truths": truths[:3]},
-        "images of Close: wrong number": {"tracks": [MethodResult("Close", truths[:2], {})]},
-        "psnr of t: wrong number": {"tracks": [MethodResult("t", truths, {"psnr": [1.0]})]},
-        "unknown metric 'vmaf'": {"tracks": [MethodResult("t", truths, {"vmaf": [1.0] * 4})]},
+        "images of Close: wrong number": {"methods": [MethodResult("Close", truths[:2], {})]},
+        "psnr of t: wrong number": {"methods": [MethodResult("t", truths, {"psnr": [1.0]})]},
+        "unknown metric 'vmaf'": {"methods": [MethodResult("t", truths, {"vmaf": [1.0] * 4})]},
     }.items():
         with pytest.raises(JaxsrError, match=words):
             section(**changes)
@@ -258,10 +258,10 @@ def test_bad_sections_and_images(made, tmp_path):
     nan[2][0, 0, 0] = np.nan
     (tmp_path / "file").write_text("x")
     for words, changes, path in (
-        ("s, t, frame 1: wrong size", {"tracks": [MethodResult("t", small, {})]}, "r.html"),
+        ("s, t, frame 1: wrong size", {"methods": [MethodResult("t", small, {})]}, "r.html"),
         ("truth frames differ in size", {"truths": [*truths[:3], small[0]]}, "r.html"),
         ("input frames differ in size", {"inputs": [*truths[:3], small[0]]}, "r.html"),
-        ("s, t, frame 3: image is not display-referred", {"tracks": [MethodResult("t", nan, {})]}, "r.html"),
+        ("s, t, frame 3: image is not display-referred", {"methods": [MethodResult("t", nan, {})]}, "r.html"),
         ("none.png: no such file", {"truths": [tmp_path / "none.png"] * 4}, "r.html"),
         ("cannot write", {}, "file/r.html"),
     ):
@@ -289,19 +289,19 @@ def test_summaries():
 def test_best_marks_ties_at_shown_digits_and_direction(made):
     truths = made[0].truths
     values = {"a": (30.001, 0.2), "b": (30.002, 0.1), "c": (29.0, 0.3)}
-    tracks = [MethodResult(n, truths, {"psnr": [p] * N, "flip": [f] * N}) for n, (p, f) in values.items()]
-    section = SequenceResult("s", range(N), truths, tracks)
+    results = [MethodResult(n, truths, {"psnr": [p] * N, "flip": [f] * N}) for n, (p, f) in values.items()]
+    section = SequenceResult("s", range(N), truths, results)
     assert best(section, "psnr", range(N)) == {"a", "b"}
     assert best(section, "flip", range(N)) == {"b"}
-    assert best(SequenceResult("s", range(N), truths, tracks[:1]), "psnr", range(N)) == set()  # no contest
-    lacking = [*tracks, MethodResult("d", truths, {})]
+    assert best(SequenceResult("s", range(N), truths, results[:1]), "psnr", range(N)) == set()  # no contest
+    lacking = [*results, MethodResult("d", truths, {})]
     assert best(SequenceResult("s", range(N), truths, lacking), "psnr", range(N)) == {"a", "b"}
 
 
 def test_extrapolated_frames_are_averaged_apart(made):
     section = made[1]
     assert section.subsets() == {"extrapolated": [1, 3], "rendered": [0, 2], "all": [0, 1, 2, 3]}
-    hold = section.tracks[0]
+    hold = section.methods[0]
     assert summary(hold, "psnr", [0, 2]).mean == math.inf
     assert summary(hold, "psnr", [1, 3]).mean < 40
     assert summary(hold, "psnr", range(N)).identical == 2
@@ -329,11 +329,11 @@ def test_json_csv_markdown_and_terminal(made, tmp_path):
     assert [r["extrapolated"] for r in rows[2 * N : 3 * N]] == ["0", "1", "0", "1"]
     assert float(rows[2 * N]["psnr"]) == math.inf
     assert rows[0]["tpsnr"] == ""
-    assert float(rows[1]["flip"]) == made[0].tracks[0].metrics["flip"][1]
+    assert float(rows[1]["flip"]) == made[0].methods[0].metrics["flip"][1]
     mark = markdown(made)
     columns = 1 + len(available()) + 2
     assert mark.count("|---") == 4 * columns - 3 * 2  # two timing columns only in the first table
-    close = summary(made[0].tracks[0], "psnr", range(N))
+    close = summary(made[0].methods[0], "psnr", range(N))
     assert f"| **{close.mean:.2f} ± {close.spread:.2f}** |" in mark
     console = Console(width=80, record=True, file=io.StringIO())
     for table in rich_tables(made):

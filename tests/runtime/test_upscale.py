@@ -1,0 +1,119 @@
+"""`upscale` into folders: runs do not mix, nothing of others is touched; frames are in memory when timed."""
+
+import json
+import shutil
+
+import pytest
+
+from jaxsr.errors import JaxsrError
+from jaxsr.runtime.load import find_method
+from jaxsr.runtime.record import SUFFIXES, claim_folder, describe_run, read_run
+from jaxsr.runtime.upscale import TOGETHER, frames_in_memory, upscale
+from tests.builders import make_sequence, random_weights
+
+
+@pytest.fixture(scope="module")
+def sequence(tmp_path_factory):
+    return make_sequence(tmp_path_factory.mktemp("data") / "seq", frames=3, size=(32, 24))
+
+
+def contents(folder):
+    return {p.relative_to(folder): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_a_run_says_what_it_is_and_goes_on(sequence, tmp_path):
+    upscale(sequence, find_method("nearest", 2), tmp_path / "out", scale=2)
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert (record["method"], record["weights"], record["scale"], record["every"]) == ("nearest", None, 2, 1)
+    assert record["frames"] == [1, 2, 3]
+    assert record["sequence"]["name"] == "seq"
+    assert record["made"]["packages"]["flax"]
+    before = contents(tmp_path / "out")
+    (tmp_path / "out" / "exr" / "0002.exr").unlink()  # as if it had been interrupted
+    upscale(sequence, find_method("nearest", 2), tmp_path / "out", scale=2)
+    assert contents(tmp_path / "out") == before
+
+
+def test_runs_do_not_mix(sequence, tmp_path):
+    out = tmp_path / "out"
+    upscale(sequence, find_method("nearest", 2), out, scale=2)
+    before = contents(out)
+    other = make_sequence(tmp_path / "other", frames=3, size=(32, 24), scales=(2, 4))
+    weights = [random_weights(tmp_path / f"{k}.safetensors", scale=2, seed=k) for k in (0, 1)]
+    for run, name, options, words in (
+        (sequence, "bilinear", {"scale": 2}, "expected method bilinear; found method nearest"),
+        (sequence, "nearest", {"scale": 2, "every": 2}, "expected every 2; found every 1"),
+        (other, "nearest", {"scale": 2}, r"expected sequence other \(.*\); found sequence seq \("),
+        (other, "nearest", {"scale": 4}, "expected scale 4, sequence other.*found scale 2, sequence seq"),
+    ):
+        with pytest.raises(JaxsrError, match=f"frames of another run; {words}.*another folder") as error:
+            upscale(run, find_method(name, options["scale"]), out, **options)
+        assert "\n" not in str(error.value)
+    assert contents(out) == before
+    runs = [describe_run(sequence, 2, 1, "net", file) for file in weights]
+    claim_folder(tmp_path / "net", runs[0])
+    with pytest.raises(JaxsrError, match=r"expected weights [0-9a-f]+; found weights [0-9a-f]+"):
+        claim_folder(tmp_path / "net", runs[1])
+
+
+@pytest.mark.parametrize("kind", ["exr", "png"])
+@pytest.mark.parametrize("name", ["0001", "0099", "beauty"])
+def test_frames_of_others_are_not_touched(sequence, tmp_path, kind, name):
+    file = tmp_path / kind / f"{name}{SUFFIXES[kind]}"
+    file.parent.mkdir()
+    file.write_text("a render")
+    with pytest.raises(JaxsrError, match=rf"holds {file.name}, which no run.json of jaxsr names"):
+        upscale(sequence, find_method("nearest", 2), tmp_path, scale=2)
+    assert contents(tmp_path) == {file.relative_to(tmp_path): b"a render"}
+
+
+@pytest.mark.parametrize(
+    "record",
+    [
+        "{",
+        "[]",
+        '{"mine": 1}',
+        '{"format": "jaxsr-run", "version": 2, "frames": [1], "kinds": ["exr"]}',
+        '{"format": "jaxsr-run", "version": 1, "frames": ["../x"], "kinds": ["exr"]}',
+        '{"format": "jaxsr-run", "version": 1, "frames": [1], "kinds": [".."]}',
+        '{"format": "jaxsr-run", "version": 1, "frames": [1], "kinds": [["exr"]]}',
+        '{"format": "jaxsr-run", "version": 1, "frames": 3, "kinds": ["exr"]}',
+    ],
+)
+def test_a_record_of_others_is_refused(sequence, tmp_path, record):
+    (tmp_path / "run.json").write_text(record)
+    with pytest.raises(JaxsrError, match="not a record of a run"):
+        upscale(sequence, find_method("nearest", 2), tmp_path, scale=2)
+    assert contents(tmp_path) == {p: record.encode() for p in contents(tmp_path)}
+
+
+def test_a_run_that_replaces_deletes_what_the_record_names(sequence, tmp_path):
+    upscale(sequence, find_method("nearest", 2), tmp_path, scale=2)
+    (tmp_path / "mine.txt").write_text("mine")
+    run = describe_run(sequence, 2, 1, "bilinear") | {"frames": [2]}
+    claim_folder(tmp_path, run, ["png"], replace=True)
+    assert sorted(p.name for p in contents(tmp_path)) == ["mine.txt", "run.json"]
+    assert read_run(tmp_path)["kinds"] == ["png"]
+
+
+def test_no_thread_decodes_while_a_frame_is_used(monkeypatch, tmp_path):
+    sequence = make_sequence(tmp_path / "seq", frames=TOGETHER + 2, size=(32, 24))
+    reading, read = [], sequence.frame
+
+    def frame(*arguments, **options):
+        reading.append(1)
+        made = read(*arguments, **options)
+        reading.pop()
+        return made
+
+    monkeypatch.setattr(sequence, "frame", frame)
+    busy = [len(reading) for _ in frames_in_memory(sequence, 2)]
+    assert busy == [0] * (TOGETHER + 2)
+
+
+def test_frames_before_one_that_cannot_be_read_stay(tmp_path):
+    sequence = make_sequence(tmp_path / "seq", frames=3, size=(32, 24))
+    shutil.copy(sequence.path / "sequence.json", sequence.path / "x2" / "0003.exr")
+    with pytest.raises(JaxsrError, match=r"0003.exr"):
+        upscale(sequence, find_method("nearest", 2), tmp_path / "out", scale=2)
+    assert sorted(p.name for p in (tmp_path / "out" / "exr").iterdir()) == ["0001.exr", "0002.exr"]
