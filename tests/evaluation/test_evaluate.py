@@ -292,7 +292,7 @@ def test_methods_are_found(data, tmp_path, monkeypatch):
         assert "\n" not in str(error.value)
     for changes, words in (
         ({"method": "magic"}, "no method 'magic' that learns"),
-        ({"method": ["taau"]}, "that learns"),
+        ({"method": ["taau"]}, "does not say which method"),
         ({"scale": None}, "header of the weights is damaged.*found scale None"),
         ({"arguments": [1]}, "header of the weights is damaged"),
         ({"arguments": {"depth": 3}}, "has no argument 'depth'"),
