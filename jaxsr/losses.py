@@ -158,7 +158,7 @@ def gaussian_window(image: Float[Array, "*b h w c"]) -> Float[Array, "*b h-10 w-
     h, w = (n - SSIM_WINDOW + 1 for n in image.shape[-3:-1])
     rows = functools.reduce(jnp.add, [t * image[..., k : k + h, :, :] for k, t in enumerate(_taps())])
     # Sums of shifted images take a third of the time of convolutions on a CPU. The barrier keeps XLA from
-    # fusing both passes into 121 taps a pixel.
+    # fusing both passes into 121 taps per pixel.
     rows = jax.lax.optimization_barrier(rows)
     return functools.reduce(jnp.add, [t * rows[..., k : k + w, :] for k, t in enumerate(_taps())])
 

@@ -1,4 +1,4 @@
-"""Networks: tensors in, tensors out. One file a network, shared blocks in `layers`."""
+"""Networks: tensors in, tensors out. One file per network; `blocks` has what they share."""
 
 from jaxsr.nets.fusion_sr import FusionSR
 from jaxsr.nets.nsrr import NSRR

@@ -6,8 +6,8 @@ and squeeze-and-excitation in float32, because means over an image need the digi
 stride-2 convolution with 3x3 kernel pads one pixel on every side, as PyTorch's does, and not only at the
 bottom and right, as "SAME" would.
 
-Some blocks compute otherwise than their textbook form, for the time it takes on a CPU: `conv_beside`,
-`convolve` and `UpConv` say why.
+Some blocks are not computed in their textbook form, which is slow on a CPU: `conv_beside`, `convolve` and
+`UpConv` say why.
 """
 
 import math
@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from jaxsr.errors import JaxsrError
 
 CHANNELS = {"depth": 1, "base_color": 3, "normal": 3, "roughness": 1, "metallic": 1, "estimate": 3}
-"""What a G-buffer may consist of, and how many channels each part has; "estimate" guesses the colour."""
+"""Parts of a G-buffer and their numbers of channels; "estimate" is a first guess of the colour."""
 XAVIER = nnx.initializers.xavier_uniform()
 Module = TypeVar("Module", bound=nnx.Module)
 
@@ -54,9 +54,9 @@ def conv(
 
 
 def conv_beside(layer: nnx.Conv, *parts: Float[Array, "b h w _"]) -> Float[Array, "b h2 w2 d"]:
-    """`layer(concatenate(parts))` as the sum of one convolution a part.
+    """`layer(concatenate(parts))` as the sum of one convolution per part.
 
-    Writing the concatenation costs half as much time as convolving it, and memory.
+    Materialising the concatenation takes half as long as the convolution itself, and memory besides.
     """
     total, first = None, 0
     for part in parts:
@@ -114,7 +114,7 @@ def check_counts(least: int = 1, **counts: int) -> None:
 
 
 def check_channels(gbuffer: Float[Array, "b h w c"], channels: int) -> None:
-    """Raise JaxsrError unless the G-buffer has so many channels."""
+    """Raise JaxsrError unless the G-buffer has this number of channels."""
     if gbuffer.shape[-1] != channels:
         raise JaxsrError(
             "wrong number of channels", where="gbuffer", expected=channels, found=gbuffer.shape[-1]
@@ -149,7 +149,7 @@ def _convolve_backward(saved: tuple[Array, Array], gradient: Array) -> tuple[Arr
         of_kernel = _convolution(x.transpose(3, 1, 2, 0), gradient.transpose(1, 2, 0, 3), pad)
         return of_x, of_kernel.transpose(1, 2, 0, 3)
 
-    # In a loop XLA has no fast convolution of another layout for CPUs: training would take 20 times as long.
+    # On CPUs, XLA's convolutions of other layouts are slow inside a loop: training would be 20 times slower.
     return jax.lax.platform_dependent(*saved, gradient, cpu=in_forward_layout, default=usual)
 
 
@@ -171,7 +171,7 @@ class LoopConv(nnx.Conv):
 
 
 def stacked(count: int, make: Callable[[nnx.Rngs], Module], rngs: nnx.Rngs) -> Module:
-    """So many modules as one, whose arrays have a leading axis; `through` runs them in a loop."""
+    """`count` modules as one module whose arrays have a leading axis; `through` runs them in a loop."""
     return nnx.split_rngs(splits=count)(nnx.vmap(make, in_axes=0, out_axes=0))(rngs)
 
 
@@ -288,8 +288,8 @@ def whole_levels(
 class UpConv(nnx.ConvTranspose):
     """A transposed convolution with a 2x2 kernel and stride 2: every pixel becomes a block of 2x2.
 
-    Blocks do not overlap, so it is one matrix product; as the dilated convolution that it is in general, its
-    gradient alone takes as long as the rest of a network's.
+    Blocks do not overlap, so one matrix product computes it. Computed as a dilated convolution, its gradient
+    alone takes as long as that of the rest of the network.
     """
 
     def __init__(self, inputs: int, outputs: int, *, dtype: DTypeLike, rngs: nnx.Rngs):

@@ -69,9 +69,9 @@ class FusionSR(nnx.Module):
 
     Args:
         scale: s, HR size over LR size; None takes that of the inputs. The parameters do not depend on it.
-        buffers: names of the G-buffer's parts, of `layers.CHANNELS`; they only say how many channels come.
+        buffers: parts of the G-buffer (`blocks.CHANNELS`); the network needs only their number of channels.
         fusion: "se-residual" is the paper's; of Table 3, "concat" puts the features of both branches side by
-            side, "add" adds them (the decoder's inputs shrink to n channels a level, its outputs stay).
+            side, "add" adds them (the decoder's inputs shrink to n channels per level, its outputs stay).
         down_kernel: size of the stride-2 kernels: 3 as published, 2 as drawn in Figure 3.
         dtype: what convolutions compute in; parameters and output stay float32.
 
@@ -115,8 +115,8 @@ class FusionSR(nnx.Module):
         Args:
             color: LR.
             gbuffer: HR, the chosen buffers side by side.
-            offset: (x, y) in [0, s): where in its s x s block of HR pixels each LR sample sits, one an image.
-                The paper's top left by default.
+            offset: (x, y) in [0, s): where in its s x s block of HR pixels each LR sample sits, one per
+                image. The paper's top left by default.
 
         Raises:
             JaxsrError: sizes or channels that do not fit together.

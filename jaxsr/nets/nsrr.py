@@ -1,7 +1,7 @@
 """Super-resolution from several LR frames with depth: NSRR.
 
 Xiao et al., "Neural supersampling for real-time rendering", SIGGRAPH 2020 (METHODS 6). The caller upsamples
-and warps between the networks, for what was made of a frame once serves as history for the next ones:
+and warps between the networks, because the features of a frame also serve as history for the next frames:
 
     features, previous_features    RGB-D -> 12 channels, LR; one net for the current frame, one for all others
     (the caller)                   zero-upsampling of both; backward warp of the previous frames' to this one
@@ -9,7 +9,7 @@ and warps between the networks, for what was made of a frame once serves as hist
 
 Contract: RGB-D `[B, h, w, 4]` in, 12 channels `[B, h, w, 12]` out, the RGB-D first; of those, at HR, one map
 of the current frame and `previous` of the others, the newest first, make colour `[B, H, W, 3]`. Any h, w, H
-and W. What the numbers mean (tone map, depth map) is up to the method; history that is not there is zeros.
+and W. What the numbers mean (tone map, depth map) is up to the method; missing history is all zeros.
 Features have the dtype of the network, the colour is float32 and not clipped. No batch norm.
 
 Colour stays RGB (METHODS 6); public re-implementations convert it to YCbCr. Left open, and chosen here: a
@@ -32,7 +32,7 @@ from jaxsr.ops import upsample
 
 RGBD = 4
 CHANNELS = RGBD + 8
-"""Of a frame: RGB-D, and what the feature network makes of it."""
+"""Of one frame: RGB-D, and the features that the network adds."""
 MOST = 10.0
 """The largest weight of a previous frame."""
 WIDTHS = ((64, 32), (64, 64), (128, 128))  # channels of the two convolutions of each level
@@ -87,7 +87,7 @@ class NSRR(nnx.Module):
                 found=f"{previous.shape}, beside a current frame of {current.shape[-1]} channels",
             )
         frames = [_whole_levels(x.astype(self.dtype)) for x in (current, *jnp.unstack(previous, axis=1))]
-        # Reweighting: from the RGB-D of all frames, one weight a pixel and previous frame.
+        # Reweighting: from the RGB-D of all frames, one weight per pixel and previous frame.
         x = self.weights(self.reweighting(jnp.concatenate([x[..., :RGBD] for x in frames], -1)))
         weights = MOST / 2 * (1 + jnp.tanh(x))
         weighted = [x * weights[..., k : k + 1] for k, x in enumerate(frames[1:])]

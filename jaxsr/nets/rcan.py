@@ -33,7 +33,7 @@ INIT = nnx.initializers.variance_scaling(1 / 3, "fan_in", "uniform")
 
 
 def check_sizes(scale: int, groups: int, blocks: int, features: int, reduction: int) -> None:
-    """Raise JaxsrError unless there is such a network."""
+    """Raise JaxsrError unless networks of these sizes exist."""
     if scale not in UPS:
         expected = " | ".join(map(str, UPS))
         raise JaxsrError("bad scale", where="scale", expected=expected, found=scale)

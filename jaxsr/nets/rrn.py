@@ -26,7 +26,7 @@ INIT = nnx.initializers.variance_scaling(0.02, "fan_in", "normal")
 
 
 def check_sizes(scale: int, blocks: int, features: int) -> None:
-    """Raise JaxsrError unless there is such a network."""
+    """Raise JaxsrError unless networks of these sizes exist."""
     check_counts(least=2, scale=scale)
     check_counts(blocks=blocks, features=features)
 

@@ -1,4 +1,4 @@
-"""Published weights to a file of ours: reading (`io`), names and layouts (`nets`), the method (`methods`)."""
+"""Published weights become a file of ours: `torch` reads them, `names` translates names and layouts."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -13,9 +13,6 @@ from jaxsr.methods import build
 from jaxsr.weights.file import into, save_weights
 from jaxsr.weights.names import PUBLISHED, method_of, translate
 from jaxsr.weights.torch import read_published
-
-SCALE = 4
-"""Where neither the shapes nor the caller tell."""
 
 
 def convert_published(
@@ -32,9 +29,9 @@ def convert_published(
     Args:
         source: `.pth`, `.npz` or `.safetensors`; nothing in it is executed.
         out: ends in `.safetensors`; replaced if it exists.
-        method: that the weights are for; by default the names of the arrays tell. The variant of its network
-            is read off their shapes.
-        scale: that they were trained for, 4 by default; not needed where the shapes tell.
+        method: that the weights are for; by default the names of the arrays decide. Their shapes decide the
+            variant of its network.
+        scale: that they were trained for; not needed where the shapes tell. By default that of `PUBLISHED`.
         buffers: the G-buffer channels in the order of training, where they are not all in the paper's order.
         half: store float16.
 
@@ -55,9 +52,9 @@ def convert_published(
     published = read_published(source)
     method = method or method_of(published, source)
     arguments = PUBLISHED[method].arguments(published, buffers, source)
-    told = arguments.get("scale", scale or SCALE)
-    if scale not in (None, told):
-        raise JaxsrError("the weights are of another scale", where=source, expected=scale, found=told)
+    trained = arguments.get("scale", scale or PUBLISHED[method].scale)
+    if scale not in (None, trained):
+        raise JaxsrError("the weights are of another scale", where=source, expected=scale, found=trained)
     new_net = build(method, arguments).new_net
     assert new_net is not None  # `build` knows only methods that learn
     net = nnx.eval_shape(lambda: new_net(nnx.Rngs(0)))
@@ -65,7 +62,7 @@ def convert_published(
     header = {
         "method": method,
         "arguments": arguments,
-        "scale": told,
+        "scale": trained,
         "jaxsr": jaxsr.__version__,
         "source": {"file": source.name, "sha256": file_digest(source)},
     }

@@ -1,6 +1,6 @@
 """Weights as safetensors with a header: nothing in them is executed when they are loaded.
 
-A file holds one array a parameter or batch statistic, named by its place in the network
+A file holds one array per parameter or batch statistic, named by its place in the network
 ("decoder1.up.kernel"), and one metadata entry, `jaxsr`: a JSON object with at least `method`, `arguments` and
 `scale`, from which `jaxsr.methods.build` makes the method again. Arrays are float32, or float16 at half the
 size; loaded, they are float32 either way. `jaxsr.weights.torch` reads the weights of other programs.
@@ -27,7 +27,7 @@ from jaxsr.weights.pickles import shortened
 State: TypeAlias = Any
 """An `nnx.State`; not annotated as one, for its own annotations are of a kind that beartype rejects."""
 KEY = "jaxsr"
-"""Of the metadata entry that holds the header."""
+"""The name of the metadata entry that holds the header."""
 HEADER_BYTES = 16 << 20
 """Of all that a safetensors file says about its arrays, which takes about 100 bytes per array."""
 

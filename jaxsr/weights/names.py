@@ -1,7 +1,9 @@
 """Published weights under our names and in our layouts, and the arguments of the network that they are for.
 
 PyTorch's layouts become JAX's: convolutions OIHW -> HWIO, transposed ones IOHW -> HWIO and mirrored, matrices
-transposed. Which published layer is which of ours is written once, in `_fusion_sr`, `_rcan` and `_rrn`.
+transposed. Everything about one published network is one row of `PUBLISHED`: how to recognise it, the
+method's arguments, and which published layer is which of ours. Another network is another row and its two
+functions.
 """
 
 import math
@@ -232,13 +234,15 @@ class Published(NamedTuple):
     """What is known of the published networks of a method."""
 
     key: str
-    """How the name of one of their arrays begins, and none of other networks'."""
+    """A beginning that names of their arrays have and those of no other network."""
     arguments: Callable[..., dict[str, Any]]
     """The method's arguments: `arguments(published, buffers, where)`."""
     layers: Callable[[nnx.Module], Iterator[tuple[str, Names]]]
     """Our layers and their published names: `layers(net)`."""
     adapt: Callable[..., dict[str, np.ndarray]] | None = None
     """Changes the arrays before the layers take them: `adapt(published, where)`."""
+    scale: int = 4
+    """What the networks were trained for, where neither their shapes nor the caller tell."""
 
 
 PUBLISHED: dict[str, Published] = {
