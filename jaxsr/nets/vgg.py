@@ -198,7 +198,7 @@ def lpips_map(
     net: Net = "vgg",
     params: Params | None = None,
 ) -> Float[Array, "*b h w"]:
-    """LPIPS of each pixel: the layers' maps, enlarged bilinearly and added (the authors' `spatial=True`).
+    """LPIPS per pixel: the layers' maps, enlarged bilinearly and added (the authors' `spatial=True`).
 
     Its mean is that of `lpips` but for the borders of the enlarged maps. A pixel of the coarsest map covers
     16 pixels and looks at some 200.

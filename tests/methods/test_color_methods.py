@@ -131,8 +131,9 @@ def test_a_network_that_is_bilinear_gives_what_bilinear_gives():
 def assert_same(found, expected):
     """Of two runs of one compiled program: equal to the bit, as docs/training.md says.
 
-    This holds on one processor, with one version of jaxlib, whatever else the machine does. Functions that
-    are compiled apart (eager, `lax.scan`, other structures of inputs) are equal but for rounding only.
+    This holds on one processor, with the same number of cores and one version of jaxlib, whatever else the
+    machine does. Functions that are compiled apart (eager, `lax.scan`, other structures of inputs) are equal
+    but for rounding only.
     """
     np.testing.assert_array_equal(found, expected)
 
