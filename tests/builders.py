@@ -1,5 +1,6 @@
 """Tiny sequences for tests, from the analytic scene; every layer can be spoilt on the way to the disk."""
 
+import json
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,8 @@ from flax import nnx
 
 from jaxsr.data import analytic
 from jaxsr.io.sequence import Sequence
-from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter
+from jaxsr.io.writing import FrameInfo, SequenceWriter
+from jaxsr.layers import LAYERS
 from jaxsr.methods import build
 from jaxsr.weights.file import save_weights
 from tests.networks import SMALL
@@ -41,7 +43,7 @@ def make_sequence(
     size: tuple[int, int] = (64, 40),
     scales: tuple[int, ...] = (2,),
     spoil: Callable[[str, int, Layers], None] | None = None,
-    jitter: Callable[[tuple[float, float]], tuple[float, float]] = lambda j: j,
+    jitter: Callable[[tuple[float, float]], tuple[float, float]] | None = None,
     still: bool = False,
     frozen: bool = False,
     **writer: Any,
@@ -50,7 +52,7 @@ def make_sequence(
 
     Args:
         spoil: called with "hr", "x2", ..., the frame's number and the layers, which it may change.
-        jitter: what the metadata says of a jitter that was rendered.
+        jitter: what the metadata says of a jitter that was rendered; the sequence is then opened unchecked.
         still, frozen: the camera, the objects do not move.
         **writer: more arguments of `SequenceWriter`.
     """
@@ -69,11 +71,18 @@ def make_sequence(
                     del layers[extra]
                 if spoil is not None:
                     spoil(name, index, layers)
-            stated = FrameInfo(
-                index, jitter(info.jitter_px), info.reset, info.world_from_view, info.tan_half_fov
-            )
-            out.write_frame(stated, images["hr"], {s: images[f"x{s}"] for s in scales})
-    return Sequence.open(path)
+            out.write_frame(info, images["hr"] if out.hr else None, {s: images[f"x{s}"] for s in scales})
+    if jitter is not None:  # the writer would refuse some
+        edit_frames(path, lambda frame: frame.update(jitter_px=jitter(frame["jitter_px"])))
+    return Sequence.open(path, check=jitter is None)
+
+
+def edit_frames(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change every entry of `frames` in sequence.json."""
+    head = json.loads((path / "sequence.json").read_text())
+    for frame in head["frames"]:
+        change(frame)
+    (path / "sequence.json").write_text(json.dumps(head))
 
 
 def random_weights(path: Path, *, scale: int, method: str = "fusion-sr", seed: int = 0) -> Path:

@@ -26,7 +26,8 @@ import numpy as np
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_folder, read_json, remove_leftovers
 from jaxsr.io.sequence import Sequence
-from jaxsr.io.writing import LAYERS, frame_file
+from jaxsr.io.writing import frame_file
+from jaxsr.layers import LAYERS
 from jaxsr.progress import Progress, silent
 
 _VERSION = 1

@@ -18,11 +18,10 @@ from jaxsr.data.cache import Arrays, open_arrays
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, Frame, GBuffer, Scale, Window
 from jaxsr.io.sequence import Sequence as Clip
-from jaxsr.io.writing import LAYERS
+from jaxsr.layers import FIELDS, LAYERS, channels
 from jaxsr.progress import Progress, silent
 
-_FIELDS = {"depth": "depth_linear", "motion": "motion_px"}
-NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in LAYERS if layer != "position")
+NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in ("color", *FIELDS))
 """All that a method can need: "lr.color", "hr.depth", ... The truth is "hr.color", and is always there."""
 
 
@@ -85,6 +84,7 @@ class WindowSource:
             for need in sorted(needs | {"hr.color"}):
                 place, layer = need.split(".")
                 _check_layer(found[lr if place == "lr" else "hr"], layer, need)
+        self._cameras = all(info.has_camera for clip in self.sequences for info in clip.infos)
         self._ends = list(itertools.accumulate(len(s) for s in self._starts))
 
     def __len__(self) -> int:
@@ -105,8 +105,12 @@ class WindowSource:
         infos = clip.infos[frames]
         jitter: Any = np.array([info.jitter_px for info in infos], float) * (self.scale > 1)
         flags: Any = (np.array([info.reset for info in infos]), np.ones(len(infos), bool))
-        exposure: Any = np.full(len(infos), clip.exposure)
-        camera = {name: np.array([getattr(info, name) for info in infos], float) for name in Camera._fields}
+        exposure: Any = np.array([clip.exposure_at(start + t) for t in range(self.length)])
+        camera: Any = None
+        if self._cameras:
+            camera = Camera(
+                *(np.array([getattr(info, n) for info in infos], float) for n in Camera._fields)  # type: ignore
+            )
         low, high = self._images(lr, "lr", frames), self._images(hr, "hr", frames)
         color = low.pop("color")
         high.pop("color")
@@ -116,7 +120,7 @@ class WindowSource:
                 lr=GBuffer(**low),
                 hr=GBuffer(**high),
                 jitter_px=jitter,
-                camera=Camera(**camera),  # type: ignore[arg-type]
+                camera=camera,
                 reset=flags[0],
                 rendered=flags[1],
                 exposure=exposure,
@@ -131,11 +135,11 @@ class WindowSource:
         scale = self.scale if place == "lr" else 1
         zeros = np.broadcast_to(np.float32(0), (self.length, h // scale, w // scale, 1))
         images: dict[str, Any] = {}
-        for layer, letters in LAYERS.items():
+        for layer, field in ({"color": "color"} | FIELDS).items():
             if f"{place}.{layer}" in self.needs:
-                images[_FIELDS.get(layer, layer)] = arrays.layers[layer][frames]
+                images[field] = arrays.layers[layer][frames]
             elif layer in ("color", "depth", "motion"):
-                images[_FIELDS.get(layer, layer)] = np.broadcast_to(zeros, (*zeros.shape[:3], len(letters)))
+                images[field] = np.broadcast_to(zeros, (*zeros.shape[:3], len(LAYERS[layer].letters)))
         return images
 
 
@@ -175,7 +179,7 @@ def _check_layer(arrays: Arrays, layer: str, need: str) -> None:
     raise JaxsrError(
         f"missing layer {layer!r}{frame}",
         where=arrays.sequence.path / arrays.resolution,
-        expected=f"what {need} needs: channels " + ", ".join(f"{layer}.{c}" for c in LAYERS[layer]),
+        expected=f"what {need} needs: channels " + ", ".join(channels(layer)),
         found="layers " + (", ".join(arrays.layers) or "none"),
         fix="export it (docs/data.md), or leave the sequence out",
     )

@@ -56,7 +56,7 @@ class Reference:
     def _read(self, i: int) -> Truth:
         sequence = self._sequence
         masks = regions(self._frame(i), self._frame(i - 1) if i else None) if self.in_regions else {}
-        return Truth(display(sequence.truth(i), sequence.exposure), masks)
+        return Truth(display(sequence.truth(i), sequence.exposure_at(i)), masks)
 
 
 class Meter:

@@ -174,7 +174,7 @@ def _write_truth_and_input(evaluation: Evaluation, out: Path) -> None:
         if rendered:
             given = np.asarray(sequence.frame(i, settings.scale).color_linear)
             path = frame_path(out / "input", "png", info.index)
-            write_png(path, display(given, sequence.exposure))
+            write_png(path, display(given, sequence.exposure_at(i)))
 
 
 def describe(settings: Settings) -> str:

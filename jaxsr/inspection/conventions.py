@@ -115,13 +115,19 @@ def normalise(current: np.ndarray) -> np.ndarray:
 
 
 def motion_evidence(
-    current: Layers, previous: Layers, info: FrameInfo, info_previous: FrameInfo, samples: int = 4000
+    current: Layers,
+    previous: Layers,
+    info: FrameInfo,
+    info_previous: FrameInfo,
+    jitter_delta: np.ndarray | tuple[float, float] = (0.0, 0.0),
+    samples: int = 4000,
 ) -> MotionEvidence:
-    """Try every convention on one pair of unjittered images.
+    """Try every convention on one pair of images.
 
     Args:
         current, previous: layers `[H, W, C]`: depth and motion, and base_color, normal, color where there.
-        info, info_previous: their cameras.
+        info, info_previous: their cameras, if they are known.
+        jitter_delta: jitter of the previous image minus that of the current one, in their pixels.
         samples: how many pixels are looked at.
     """
     h, w = current["depth"].shape[:2]
@@ -131,7 +137,8 @@ def motion_evidence(
     }
     scale = normalise(_blur(features(current)))
     solid = ~is_sky(current["depth"])[..., 0]
-    still_motion = static_motion(current["depth"], info, info_previous)[solid]
+    known = info.has_camera and info_previous.has_camera
+    still_motion = static_motion(current["depth"], info, info_previous)[solid] if known else np.zeros((1, 2))
     evidence = MotionEvidence(
         moves=bool(np.abs(finite_or_zero(current["motion"])).max(initial=0) > 1e-7),
         camera_px=float(np.median(np.linalg.norm(still_motion, axis=-1))) if solid.any() else 0.0,
@@ -148,19 +155,22 @@ def motion_evidence(
         if not len(p):
             continue
         target = f_here[p[:, 1], p[:, 0]]
-        expected = static_motion(here["depth"], info_here, info_there)[p[:, 1], p[:, 0]]
-        still = _error(target, f_there, p)
+        expected = np.full((len(p), 2), np.nan)
+        if known:
+            expected = static_motion(here["depth"], info_here, info_there)[p[:, 1], p[:, 0]]
+        shift = np.asarray(jitter_delta) * (-1 if forward else 1)  # p - shift shows there what p shows here
+        still = _error(target, f_there, p - shift)
         cap = 2 * float(still.mean())
         none = float(np.minimum(still, cap).mean())
         if not forward:
-            evidence.camera_px = float(np.median(np.linalg.norm(expected, axis=-1)))
+            evidence.camera_px = float(np.median(np.linalg.norm(expected, axis=-1))) if known else 0.0
             evidence.image_change = none
         for c in CONVENTIONS:
             if c.forward != forward:
                 continue
             vectors = c.to_pixels(motion[p[:, 1], p[:, 0]], (w, h)) * (-1 if forward else 1)
-            error = np.minimum(_error(target, f_there, p - vectors), cap)
-            error[~_inside(p - vectors, w, h)] = cap
+            error = np.minimum(_error(target, f_there, p - vectors - shift), cap)
+            error[~_inside(p - vectors - shift, w, h)] = cap
             evidence.image[c] = float(error.mean()) / none if none > 0 else 1.0
             evidence.camera[c] = float(np.median(np.linalg.norm(vectors - expected, axis=-1)))
     return evidence

@@ -8,7 +8,7 @@ at all. It changes nothing. `print_report` shows it to a person, `Report.to_json
 import dataclasses
 import math
 from collections.abc import Mapping, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -31,9 +31,11 @@ from jaxsr.inspection.verdicts import (
     judge_normal,
     judge_values,
 )
+from jaxsr.io.description import check_info
 from jaxsr.io.exr import read_exr
-from jaxsr.io.sequence import Sequence
-from jaxsr.io.writing import LAYERS, frame_file
+from jaxsr.io.sequence import DERIVED, Sequence
+from jaxsr.io.writing import frame_file
+from jaxsr.layers import LAYERS, channels
 
 
 @dataclass
@@ -95,8 +97,9 @@ def inspect(
         _single(sequence, i, images, evidence)
         if last is not None and last[0] == i - 1 and not sequence.infos[i].reset:
             _pair(sequence, i, images, last[1], evidence)
-            if "hr" in images and "hr" in last[1]:
-                pairs.append((i, images["hr"]))
+            main = _main(sequence, images)
+            if main is not None and main in last[1]:
+                pairs.append((i, images[main]))
         last = (i, images)
     absent = _absent(sequence, layers)
     faults += map(str, absent.values())
@@ -113,8 +116,11 @@ def inspect(
             f"{len(far)} frames state more than half an LR pixel, first frame {far[0].index}: ({x:g}, {y:g})"
         )
         findings.append(Finding("jitter range", "bad", f"{text}; expected each within [-0.5, 0.5]"))
+    findings += _judge_matrices(sequence)
     whole = stats.keys() - absent.keys()
-    missing = {name: _lacks(sequence, set(wanted), whole) for name, wanted in (needs or {}).items()}
+    missing = {
+        name: _lacks(sequence, set(wanted), whole, stats.keys()) for name, wanted in (needs or {}).items()
+    }
     return Report(
         path=str(sequence.path),
         name=sequence.name,
@@ -172,57 +178,72 @@ def _choose(count: int, most: int) -> list[int]:
 
 def _read(sequence: Sequence, i: int, resolution: str, stats: dict) -> dict[str, np.ndarray]:
     where = frame_file(sequence.path, resolution, sequence.infos[i].index)
-    channels, _ = read_exr(where)
+    scale = 1 if resolution == "hr" else int(resolution[1:])
+    width, height = sequence.size
+    because = f"sequence.json: HR {width}x{height}, scale {scale}"
+    planes, _ = read_exr(where, size=(height // scale, width // scale), because=because)
     stored = {
-        layer: [channels[f"{layer}.{c}"] for c in letters]
-        for layer, letters in LAYERS.items()
-        if all(f"{layer}.{c}" in channels for c in letters)
+        layer: [planes[name] for name in channels(layer)]
+        for layer in LAYERS
+        if planes.keys() >= set(channels(layer))
     }
-    images = {layer: np.stack([p.astype(np.float32) for p in planes], -1) for layer, planes in stored.items()}
+    images = {layer: np.stack([p.astype(np.float32) for p in of], -1) for layer, of in stored.items()}
     sky = float(cv.is_sky(images["depth"]).mean()) if "depth" in images else 0.0
     for layer, x in images.items():
         size = f"{x.shape[1]}x{x.shape[0]}"
         new = BufferStats(resolution, layer, size, str(stored[layer][0].dtype))
         stats.setdefault((resolution, layer), new).add(x, sky)
-    scale = 1 if resolution == "hr" else int(resolution[1:])
-    expected = (sequence.size[1] // scale, sequence.size[0] // scale)
-    for layer, letters in LAYERS.items():
-        lost = [f"{layer}.{c}" for c in letters if f"{layer}.{c}" not in channels]
-        if 0 < len(lost) < len(letters):
+    for layer in LAYERS:
+        lost = [name for name in channels(layer) if name not in planes]
+        if 0 < len(lost) < len(channels(layer)):
             raise JaxsrError(f"layer {layer!r} lacks channel {lost[0]!r}", where=where, fix="export it again")
-    for layer in ("depth", "motion") if resolution == "hr" else ("color", "depth", "motion"):
-        if layer not in images:
-            found = ", ".join(images) or "none that jaxsr knows"
-            raise JaxsrError(f"missing layer {layer!r}", where=where, found=f"layers {found}")
-    for layer, x in images.items():
-        if x.shape[:2] != expected:
-            raise JaxsrError(
-                f"layer {layer!r} has the wrong size", where=where, expected=expected, found=x.shape[:2]
-            )
+    if resolution != "hr" and "color" not in images:
+        found = ", ".join(images) or "none that jaxsr knows"
+        raise JaxsrError("missing layer 'color'", where=where, found=f"layers {found}")
     return images
+
+
+def _main(sequence: Sequence, images: Mapping[str, Mapping[str, np.ndarray]]) -> str | None:
+    """The largest resolution that has depth and motion in this frame: they are judged there."""
+    places = sorted(sequence.resolutions, key=lambda r: 1 if r == "hr" else int(r[1:]))
+    return next((p for p in places if images.get(p, {}).keys() >= {"depth", "motion"}), None)
+
+
+def _judge_matrices(sequence: Sequence) -> list[Finding]:
+    """A finding if a camera is not rigid; opening a sequence without checks lets it through."""
+    faults = []
+    for info in sequence.infos:
+        try:
+            check_info(replace(info, jitter_px=(0.0, 0.0)), "sequence.json")
+        except JaxsrError as e:
+            faults.append(str(e))
+    more = f" (and {len(faults) - 1} more)" if len(faults) > 1 else ""
+    return [Finding("camera matrix", "bad", faults[0] + more, {"faults": faults})] if faults else []
 
 
 def _single(sequence: Sequence, i: int, images: Mapping[str, Mapping[str, np.ndarray]], to: Evidence) -> None:
     info = sequence.infos[i]
+    hr = images.get("hr", {})
     for scale in (s for s in sequence.scales if s > 1):
-        if f"x{scale}" in images and "hr" in images:
+        if "depth" in images.get(f"x{scale}", {}) and "depth" in hr:
             stated = np.asarray(info.jitter_px, float)
-            errors, best = cv.jitter_evidence(images[f"x{scale}"], images["hr"], stated, scale)
+            errors, best = cv.jitter_evidence(images[f"x{scale}"], hr, stated, scale)
             to.jitter.setdefault(scale, [])
             if best is not None:
                 to.jitter[scale].append((stated, errors, best))
-    hr = images.get("hr", {})
-    if not hr:
+    main = images.get(_main(sequence, images) or "", {})
+    if not main:
         return
-    finite = hr["depth"][np.isfinite(hr["depth"])]
-    if finite.size and np.isfinite(hr["depth"]).all() and cv.is_sky(hr["depth"]).any():
+    finite = main["depth"][np.isfinite(main["depth"])]
+    if finite.size and np.isfinite(main["depth"]).all() and cv.is_sky(main["depth"]).any():
         to.sky_values.add(float(finite.max()))
-    if "normal" in hr:
-        solid = ~cv.is_sky(hr["depth"])[..., 0]
+    if "normal" in main:
+        solid = ~cv.is_sky(main["depth"])[..., 0]
         if solid.any():
-            length = np.linalg.norm(hr["normal"][solid].astype(np.float64), axis=-1)
+            length = np.linalg.norm(main["normal"][solid].astype(np.float64), axis=-1)
             to.normal_length.append(float(np.quantile(np.abs(length - 1), 0.9)))
-        to.normal.append(cv.normal_evidence(hr["depth"], hr["normal"], info))
+        if info.has_camera:
+            to.normal.append(cv.normal_evidence(main["depth"], main["normal"], info))
 
 
 def _pair(
@@ -233,12 +254,15 @@ def _pair(
     to: Evidence,
 ) -> None:
     now, then = sequence.infos[i], sequence.infos[i - 1]
-    if "hr" in images and "hr" in before:
-        to.motion.append(cv.motion_evidence(images["hr"], before["hr"], now, then))
+    jitters = np.asarray(now.jitter_px, float), np.asarray(then.jitter_px, float)
+    main = _main(sequence, images)
+    if main is not None and main == _main(sequence, before):
+        delta = jitters[1] - jitters[0] if main != "hr" else np.zeros(2)
+        to.motion.append(cv.motion_evidence(images[main], before[main], now, then, delta))
     for scale in (s for s in sequence.scales if s > 1):
-        if f"x{scale}" in images and "hr" in images:
-            jitters = np.asarray(now.jitter_px, float), np.asarray(then.jitter_px, float)
-            errors = cv.lr_motion_evidence(images[f"x{scale}"], images["hr"], *jitters, scale)
+        lr, hr = images.get(f"x{scale}", {}), images.get("hr", {})
+        if lr.keys() >= {"depth", "motion"} and hr.keys() >= {"depth", "motion"}:
+            errors = cv.lr_motion_evidence(lr, hr, *jitters, scale)
             if errors:
                 to.lr_motion.setdefault(scale, []).append(errors)
 
@@ -258,11 +282,19 @@ def _absent(
     return found
 
 
-def _lacks(sequence: Sequence, wanted: set[str], whole: Set[tuple[str, str]]) -> list[str]:
-    """Of the wanted buffers those that not every frame has; `whole` holds resolutions and layers."""
+def _lacks(
+    sequence: Sequence, wanted: set[str], whole: Set[tuple[str, str]], somewhere: Set[tuple[str, str]]
+) -> list[str]:
+    """Of the wanted buffers those that not every frame has, and that cannot be derived.
+
+    Args:
+        whole, somewhere: resolutions and layers that all frames have, and that some have.
+    """
     have = {f"hr.{layer}" for place, layer in whole if place == "hr"}
     small = [r for r in sequence.resolutions if r != "hr"] or ["hr"]
     have |= {f"lr.{layer}" for layer in LAYERS if all((place, layer) in whole for place in small)}
+    if small != ["hr"] and have >= {f"lr.{layer}" for layer in DERIVED}:
+        have |= {f"hr.{layer}" for layer in DERIVED if ("hr", layer) not in somewhere}
     return sorted(wanted - have)
 
 

@@ -202,7 +202,10 @@ def judge_camera(
     if not pairs or convention is None or convention.forward:
         return Finding("camera and depth", "warn", "cannot tell without backward motion that is understood")
     i, hr = pairs[0]
-    motion = convention.to_pixels(cv.finite_or_zero(hr["motion"]), sequence.size)
+    if not (sequence.infos[i].has_camera and sequence.infos[i - 1].has_camera):
+        return Finding("camera and depth", "warn", "cannot tell: the camera is not known")
+    h, w = hr["motion"].shape[:2]
+    motion = convention.to_pixels(cv.finite_or_zero(hr["motion"]), (w, h))
     errors = cv.camera_evidence(hr["depth"], motion, sequence.infos[i], sequence.infos[i - 1])
     if not errors:
         return Finding("camera and depth", "warn", "cannot tell: all is sky")

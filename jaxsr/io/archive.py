@@ -34,10 +34,12 @@ from jaxsr.files import (
     write_text,
 )
 from jaxsr.io.archive_coding import CODES, decode_frame, encode_frame, largest_blob
+from jaxsr.io.description import check_head, frame_info, has_hr
 from jaxsr.io.exr import read_exr
 from jaxsr.io.exr_header import MAX_PIXELS
-from jaxsr.io.sequence import Sequence, check_head, frame_info
-from jaxsr.io.writing import LAYERS, FrameInfo, SequenceWriter, frame_file
+from jaxsr.io.sequence import Sequence
+from jaxsr.io.writing import FrameInfo, SequenceWriter, frame_file
+from jaxsr.layers import LAYERS
 
 FORMAT, VERSION = "jaxsr-archive", 1
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -49,9 +51,9 @@ def _raw_layers(path: Path) -> dict[str, np.ndarray]:
     """The layers of a file that an archive keeps: all but position, which depth and camera give."""
     channels, _ = read_exr(path, pad=False)
     layers = {
-        layer: np.stack([channels[f"{layer}.{c}"].astype(np.float32) for c in letters], -1)
-        for layer, letters in LAYERS.items()
-        if layer != "position" and f"{layer}.{letters[0]}" in channels
+        name: np.stack([channels[f"{name}.{c}"].astype(np.float32) for c in layer.letters], -1)
+        for name, layer in LAYERS.items()
+        if name != "position" and f"{name}.{layer.letters[0]}" in channels
     }
     for layer in ("depth", "motion"):
         if layer not in layers:
@@ -229,6 +231,7 @@ def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folde
         name=head.get("name", Path(name).name),
         size=tuple(head["size"]),
         scales=head["scales"],
+        hr=has_hr(head),
         fps=head.get("fps", 24.0),
         exposure=head.get("exposure", 1.0),
         license=head.get("license", ""),
@@ -254,6 +257,6 @@ def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folde
             )
             if len(images[info.index]) == len(writer.resolutions):
                 done = images.pop(info.index)
-                writer.write_frame(info, done.pop("hr"), {int(r[1:]): x for r, x in done.items()})
+                writer.write_frame(info, done.pop("hr", None), {int(r[1:]): x for r, x in done.items()})
     writer.close()
     return folder

@@ -38,6 +38,7 @@ from jaxsr.ops.masks import (
     position_mask,
     stencil_mask,
 )
+from jaxsr.ops.motion import dilate_motion, hr_from_lr
 from jaxsr.ops.reprojection import reproject
 from jaxsr.ops.resampling import (
     pixel_grid,
@@ -66,10 +67,12 @@ __all__ = [
     "demodulate",
     "demodulation_divisor",
     "depth_mask",
+    "dilate_motion",
     "disocclusion_mask",
     "forward_splat",
     "from_display",
     "halton",
+    "hr_from_lr",
     "inverse_tone_map",
     "jitter_sequence",
     "jittered_motion",

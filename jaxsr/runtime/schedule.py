@@ -54,7 +54,8 @@ def check_needs(method: Method, sequence: Sequence, scale: int) -> None:
             found=", ".join(sorted(have)),
             fix="export these buffers, or choose a method that does without (jaxsr inspect lists them)",
         )
-    if "hr.motion" in method.needs and len(sequence) > 1 and not sequence.infos[1].reset:
+    cameras = all(info.has_camera for info in sequence.infos[:2])
+    if cameras and "hr.motion" in method.needs and len(sequence) > 1 and not sequence.infos[1].reset:
         before, after = (np.asarray(info.world_from_view) for info in sequence.infos[:2])
         motion = np.asarray(sequence.frame(1, scale, rendered=False).hr.motion_px)
         if not motion.any() and not np.allclose(before, after, atol=1e-6):

@@ -18,7 +18,7 @@ from jaxsr.data.windows import NEEDS, WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera
 from jaxsr.io.geometry import world_position
-from jaxsr.io.writing import PRECISION
+from jaxsr.layers import LAYERS
 from tests.builders import make_sequence
 
 SIZE = (96, 60)
@@ -34,7 +34,7 @@ def scene(scale=2):
             size=SIZE,
             scales=(2, 3),
             frozen=True,
-            precision=dict.fromkeys(PRECISION, "float"),
+            precision=dict.fromkeys(LAYERS, "float"),
         )
         source = WindowSource([seq.path], scale=scale, needs=NEEDS, length=2, cache=Path(folder) / "c")
         window = jax.tree.map(np.array, source[1])

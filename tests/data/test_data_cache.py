@@ -15,7 +15,7 @@ import pytest
 from jaxsr.data.cache import default_cache, open_arrays
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import read_exr, write_exr
-from jaxsr.io.writing import LAYERS
+from jaxsr.layers import LAYERS
 from tests.builders import make_sequence
 
 SMALL = {"size": (16, 8), "scales": (2,)}
@@ -171,7 +171,7 @@ def test_bad_pixels_are_named_and_leave_nothing(tmp_path, layer, value):
     seq = make_sequence(tmp_path / "s", **SMALL)
     file = seq.path / "hr/0003.exr"
     channels, _ = read_exr(file)
-    channels[f"{layer}.{LAYERS[layer][0]}"][1, 2] = value
+    channels[f"{layer}.{LAYERS[layer].letters[0]}"][1, 2] = value
     write_exr(file, channels)
     with pytest.raises(JaxsrError, match=rf"0003.exr: frame 3: layer '{layer}' .* x=2 y=1"):
         open_arrays(seq.path, ("hr",), cache=tmp_path / "cache")

@@ -15,7 +15,8 @@ from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.sequence import FrameInfo, Sequence, SequenceWriter, prefetch
-from jaxsr.io.writing import LAYERS, round_mantissa
+from jaxsr.io.writing import round_mantissa
+from jaxsr.layers import LAYERS, channels
 from tests.builders import frame_info, halton_jitter, make_sequence
 
 SIZE = (32, 24)
@@ -125,7 +126,8 @@ def test_missing_channel_and_layer(seq):
         seq.frame(0, 2)
     change_frame(seq, "hr/0002.exr", lambda c: c.pop("depth.Z"))
     with pytest.raises(JaxsrError, match=r"frame 2: missing layer 'depth'.*found layers base_color, "):
-        seq.frame(1, 4)
+        seq.frame(1, 4, needs=frozenset({"hr.depth"}))
+    assert seq.frame(1, 4).hr.depth_linear is None, "without needs nothing but colour must be there"
 
 
 @pytest.mark.parametrize("layer", ["color.G", "motion.X", "normal.Z", "base_color.B", "depth.Z"])
@@ -190,40 +192,63 @@ def test_a_file_lost_or_cut_after_opening(seq):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda h: h.update(version=9), "unsupported version.*expected 1; found 9"),
-        (lambda h: h.update(format="other"), 'not a sequence.*"jaxsr-sequence"; found other'),
+        (lambda h: h.update(version=9), "unsupported version.*expected 1 or 2; found 9"),
+        (lambda h: h.update(format="other"), 'not a sequence.*"jaxsr-sequence"; found "other"'),
         (lambda h: h.update(size=[32]), r"bad size.*found \[32\]"),
         (lambda h: h.update(scales=[5]), "scale 5 does not divide the size"),
         (lambda h: h.update(scales="2"), "bad scales"),
         (lambda h: h.update(frames=[]), "no frames"),
-        (lambda h: h["frames"][1].pop("camera"), "entry 1 of frames.*missing 'camera'"),
+        (lambda h: h["frames"][1]["camera"].pop("tan_half_fov"), "entry 1 of frames.*missing 'tan_half_fov'"),
+        (lambda h: h["frames"][1].pop("index"), "entry 1 of frames.*missing 'index'"),
         (lambda h: h["frames"][1].update(jitter_px=[0]), "entry 1 of frames"),
-        (lambda h: h["frames"][2].update(jitter_px=[0, float("nan")]), "frame 3: camera or jitter"),
+        (lambda h: h["frames"][2].update(jitter_px=[0, float("nan")]), "bad JSON.*NaN"),
         (lambda h: h["frames"][1].update(index=7), "frame 7 follows frame 1"),
         (lambda h: h["frames"].reverse(), "frame 2 follows frame 3"),
         (lambda h: h.update(fps="abc"), 'bad fps; expected a number above 0; found "abc"'),
         (lambda h: h.update(fps=0), "bad fps.*found 0"),
-        (lambda h: h["frames"][1].update(jitter_px=[10**400, 0]), "entry 1 of frames"),
-        (lambda h: h.update(fps=float("inf")), "bad fps.*found Infinity"),
+        (lambda h: h["frames"][1].update(jitter_px=[10**400, 0]), "bad JSON.*integer of 401 digits"),
+        (lambda h: h.update(fps=float("inf")), "bad JSON.*found Infinity"),
         (lambda h: h.update(exposure=None), "bad exposure; expected a number above 0; found null"),
         (lambda h: h.update(exposure=0.0), "bad exposure.*found 0.0"),
         (lambda h: h.update(exposure=-1), "bad exposure.*found -1"),
-        (lambda h: h.update(exposure=float("nan")), "bad exposure.*found NaN"),
+        (lambda h: h.update(exposure=float("nan")), "bad JSON.*found NaN"),
         (lambda h: h.update(exposure=True), "bad exposure.*found true"),
         (lambda h: h.update(name=["a"]), r'bad name; expected a text; found \["a"\]'),
         (lambda h: h.update(generator="x"), 'bad generator.*found "x"'),
-        (lambda h: h["frames"][1].update(index=float("inf")), "entry 1 of frames.*found index Infinity"),
-        (lambda h: h["frames"][1].update(index=1.5), "entry 1 of frames.*found index 1.5"),
-        (lambda h: h["frames"][1].update(index="2"), 'entry 1 of frames.*found index "2"'),
-        (lambda h: h["frames"][0].update(index=-1), "entry 0 of frames.*found index -1"),
+        (lambda h: h["frames"][1].update(index=float("inf")), "bad JSON.*found Infinity"),
+        (lambda h: h["frames"][1].update(index=1.5), "bad index.*found 1.5"),
+        (lambda h: h["frames"][1].update(index="2"), 'bad index.*found "2"'),
+        (lambda h: h["frames"][0].update(index=-1), "bad index; expected 0 to .*found -1"),
         (lambda h: h["frames"][1]["camera"].update(tan_half_fov=[0, 0]), "frame 2: bad tan_half_fov"),
         (lambda h: h["frames"][1]["camera"].update(tan_half_fov=[0.5, -0.3]), "above 0; found .0.5, -0.3."),
         (
             lambda h: h["frames"][1]["camera"].update(lens_shift=[float("nan"), 0]),
-            "frame 2: camera or jitter",
+            "bad JSON.*found NaN",
         ),
-        (lambda h: h["frames"][1]["camera"].update(world_from_view=[[0] * 4] * 4), "frame 2.*is singular"),
-        (lambda h: h["frames"][1]["camera"]["world_from_view"][0].__setitem__(3, float("inf")), "not finite"),
+        (
+            lambda h: h["frames"][1]["camera"].update(world_from_view=[[0] * 4] * 4),
+            "frame 2: world_from_view",
+        ),
+        (lambda h: h["frames"][1].update(jitter_px=[0.8, 0.25]), r"frame 2: jitter of.*found \[0.8, 0.25\]"),
+        (lambda h: h["frames"][1].update(jitter_px=["0.1", 0]), "entry 1 of frames.*found jitter_px"),
+        (lambda h: h["frames"][1].update(reset="false"), 'frame 2: bad reset.*true or false; found "false"'),
+        (lambda h: h["frames"][1].update(cut=True), "found .reset. and .cut."),
+        (lambda h: h["frames"][1].update(exposure=0), "frame 2: bad exposure.*above 0; found 0"),
+        (lambda h: h["frames"][1].update(exposure=True), "frame 2: bad exposure.*found true"),
+        (
+            lambda h: h["frames"][1]["camera"].update(world_from_view=np.diag([2, 2, 2, 1]).tolist()),
+            "not rigid",
+        ),
+        (lambda h: h["frames"][1]["camera"].update(world_from_view=np.diag([-1, 1, 1, 1]).tolist()), "rigid"),
+        (lambda h: h["frames"][1]["camera"]["world_from_view"][3].__setitem__(0, 0.1), "not rigid"),
+        (
+            lambda h: h.update(size=[2**40, 24]),
+            r"bad size; expected 1 to 65536 pixels.*found \[1099511627776",
+        ),
+        (lambda h: h.update(size=[True, True]), r"bad size.*found \[true, true\]"),
+        (lambda h: h.update(hr="no"), 'bad hr; expected true or false; found "no"'),
+        (lambda h: h.update(hr=False, scales=[1]), "there are no images"),
+        (lambda h: h["frames"][1]["camera"]["world_from_view"][0].__setitem__(3, float("inf")), "bad JSON"),
     ],
 )
 def test_bad_descriptions(seq, change, message):
@@ -302,11 +327,11 @@ def test_resuming_another_sequence_is_refused(tmp_path):
     ("hr", "lr", "message"),
     [
         ({}, {2: {"color": None}}, "x2: missing layer 'color'"),
-        ({"motion": None}, {2: {}}, "hr: missing layer 'motion'"),
+        (dict.fromkeys(LAYERS), {2: {}}, "hr: no layers"),
         ({"colour": np.zeros((24, 32, 3))}, {2: {}}, "unknown layer 'colour'"),
         ({"normal": np.zeros((24, 31, 3))}, {2: {}}, r"'normal' has the wrong size; expected \(24, 32, 3\)"),
         ({"roughness": np.zeros((24, 32, 3))}, {2: {}}, "'roughness' has the wrong size"),
-        ({"color": np.full((24, 32, 3), np.nan)}, {2: {}}, "'color' holds NaN or Inf; found 2304 values"),
+        ({"color": np.full((24, 32, 3), np.nan)}, {2: {}}, "'color' holds NaN or Inf.*found 768 pixels"),
         ({"base_color": np.full((24, 32, 3), 1e6)}, {2: {}}, "'base_color' does not fit half"),
         ({}, {4: {}}, r"wrong LR scales; expected \[2\]; found \[4\]"),
     ],
@@ -333,7 +358,7 @@ def test_writer_arguments(tmp_path):
         writer(tmp_path, scales=(5,))
     with pytest.raises(JaxsrError, match="bad fps; expected a number above 0; found 0"):
         writer(tmp_path, fps=0)
-    with pytest.raises(JaxsrError, match=r"bad exposure.*found nan"):
+    with pytest.raises(JaxsrError, match=r"bad exposure.*found NaN"):
         writer(tmp_path, exposure=float("nan"))
     with pytest.raises(JaxsrError, match="bad precision of 'depth'"):
         writer(tmp_path, precision={"depth": "double"})
@@ -418,5 +443,18 @@ def test_the_examples_of_the_documentation_run(tmp_path, monkeypatch):
     assert len(Sequence.open(tmp_path / "wall")) == 3
     head = json.loads(re.search(r"```json\n(.*?)```", text, re.S)[1])
     assert set(head) == set(json.loads((tmp_path / "wall/sequence.json").read_text()))
-    for layer, letters in LAYERS.items():
-        assert f"| {layer} | {layer}.{letters[0]}" in text
+
+
+def layer_row(layer):
+    """The row of a layer in docs/data.md."""
+    span = {(-np.inf, np.inf): "any", (0.0, np.inf): "above 0"}
+    limits = span.get((layer.low, layer.high), f"{layer.low:g} to {layer.high:.0f}")
+    sky = {None: "as seen", np.inf: "+inf"}.get(layer.sky, f"{layer.sky or 0:g}")
+    cells = (layer.name, " ".join(channels(layer.name)), layer.stored, layer.unit, limits, sky)
+    return f"| {' | '.join(cells)} |"
+
+
+def test_the_table_of_layers_in_the_documentation():
+    text = (Path(__file__).parents[2] / "docs/data.md").read_text()
+    table = [line for line in text.splitlines() if re.match(r"\| [a-z_]+ \| [a-z_]+\.[A-Z]", line)]
+    assert table == [layer_row(layer) for layer in LAYERS.values()]
