@@ -19,7 +19,7 @@ def cut_at(seq, *indices):
     file = seq.path / "sequence.json"
     head = json.loads(file.read_text())
     for frame in head["frames"]:
-        frame["cut"] = frame["index"] in indices
+        frame["reset"] = frame["index"] in indices
     file.write_text(json.dumps(head))
 
 

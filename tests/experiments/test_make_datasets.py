@@ -220,7 +220,7 @@ def test_damaged_manifests_and_checksums(tmp_path):
         with pytest.raises(JaxsrError, match=words):
             archive.read_manifest(write_manifest(tmp_path / "a.jsrz", manifest))
     file = write_manifest(tmp_path / "a.jsrz", head | {"sequences": {"a": description(frames=[{}])}})
-    with pytest.raises(JaxsrError, match=r"a\.jsrz, a: entry 0 of frames is not right.*missing 'camera'"):
+    with pytest.raises(JaxsrError, match=r"a\.jsrz, a: entry 0 of frames is not right.*missing 'index'"):
         archive.unpack_sequence(file, archive.read_manifest(file), "a", tmp_path / "out")
     assert not (tmp_path / "out").exists()
     (tmp_path / "a.jsrz.sha256").write_text("")
