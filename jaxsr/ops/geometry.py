@@ -11,6 +11,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
@@ -34,14 +35,15 @@ def rotate(matrix: Array, vectors: Array) -> Array:
 
 def view_rays(pixels: Array, camera: Camera, size: tuple[int, int]) -> Array:
     """View-space rays of unit view depth through `[h, w, 2]` positions of the unjittered image."""
-    ndc = (pixels + 0.5) * jnp.array([2 / size[1], 2 / size[0]], jnp.float32)[None, None] - 1
+    ndc = (pixels + 0.5) * jnp.array([2 / size[1], 2 / size[0]], pixels.dtype)[None, None] - 1
     xy = (ndc + camera.lens_shift[None, None]) * camera.tan_half_fov[None, None]
     return jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
 
 
-def looked_at(size: tuple[int, int], jitter: Array | None) -> Array:
-    """Where in the unjittered image each pixel looked: p + J."""
-    return pixel_grid(*size) if jitter is None else pixel_grid(*size) + jitter[None, None]
+def unjittered_positions(size: tuple[int, int], jitter: Array | None, dtype: DTypeLike) -> Array:
+    """The position in the unjittered image that each pixel shows: p + J."""
+    grid = pixel_grid(*size, dtype)
+    return grid if jitter is None else grid + jitter[None, None]
 
 
 def view_from_view(camera: Camera, previous: Camera) -> tuple[Array, Array]:
@@ -59,7 +61,7 @@ def _project_view(points: Array, camera: Camera, size: tuple[int, int]) -> tuple
     ndc = (
         points[..., :2] / jnp.where(before, depth, 1.0) / camera.tan_half_fov[lead] - camera.lens_shift[lead]
     )
-    half_size = jnp.array([size[1] / 2, size[0] / 2], jnp.float32)[lead]
+    half_size = jnp.array([size[1] / 2, size[0] / 2], points.dtype)[lead]
     return jnp.where(before, (ndc + 1) * half_size - 0.5, BEHIND_PX), depth
 
 
@@ -87,7 +89,9 @@ def view_directions(
     _check_size("view_directions", size)
 
     def one(matrix: Array, camera: Camera, jitter: Array | None) -> Array:
-        return rotate(matrix[:3, :3], view_rays(looked_at(size, jitter), camera, size))
+        return rotate(
+            matrix[:3, :3], view_rays(unjittered_positions(size, jitter, matrix.dtype), camera, size)
+        )
 
     return over_batch(one, jnp.asarray(camera.world_from_view), camera, jitter_px, ndim=2)
 
@@ -107,7 +111,9 @@ def world_position(
     def one(depth: Array, camera: Camera, jitter: Array | None) -> Array:
         matrix = jnp.asarray(camera.world_from_view)
         size = (depth.shape[0], depth.shape[1])
-        rays = rotate(matrix[:3, :3], view_rays(looked_at(size, jitter), camera, size))
+        rays = rotate(
+            matrix[:3, :3], view_rays(unjittered_positions(size, jitter, depth.dtype), camera, size)
+        )
         hit = jnp.isfinite(depth)
         point = matrix[None, None, :3, 3] + jnp.where(hit, depth, 0.0) * rays
         return jnp.where(hit, point, 0.0)
@@ -167,7 +173,7 @@ def camera_motion(
     def one(depth: Array, camera: Camera, before: Camera, jitter: Array | None) -> Array:
         size = (depth.shape[0], depth.shape[1])
         turn, shift = view_from_view(camera, before)
-        here = looked_at(size, jitter)
+        here = unjittered_positions(size, jitter, depth.dtype)
         # Homogeneous points ray + shift / depth: at infinite depth only the rotation is left.
         inverse = jnp.where(jnp.isfinite(depth), 1 / jnp.where(depth > _NEAR, depth, _NEAR), 0.0)
         points = rotate(turn, view_rays(here, camera, size)) + inverse * shift[None, None]

@@ -28,6 +28,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxsr.errors import JaxsrError
@@ -117,9 +118,9 @@ def unjittered_motion(
     return motion_jittered_px - _at_pixels(previous_jitter_px - jitter_px)
 
 
-def _output_pixels(shape: tuple[int, ...], scale: float) -> Array:
+def _output_pixels(shape: tuple[int, ...], scale: float, dtype: DTypeLike) -> Array:
     """p of the equations: output pixels in pixels of the unjittered LR image (`ori_uv`)."""
-    return jnp.broadcast_to((pixel_grid(shape[-3], shape[-2]) + 0.5) / scale - 0.5, shape)
+    return jnp.broadcast_to((pixel_grid(shape[-3], shape[-2], dtype) + 0.5) / scale - 0.5, shape)
 
 
 def _to_output(position: Array, scale: float) -> Array:
@@ -140,7 +141,7 @@ def current_positions(
         scale: output size divided by LR size.
     """
     shape = (*jitter_px.shape[:-1], *size, 2)
-    return _output_pixels(shape, scale) - _at_pixels(jitter_px)
+    return _output_pixels(shape, scale, jitter_px.dtype) - _at_pixels(jitter_px)
 
 
 @functools.partial(jax.jit, static_argnames=("size", "mode", "boundary"))
@@ -191,7 +192,7 @@ def positions_from_jittered_motion(
         previous_jitter_px: J_{t-1} in LR pixels.
         scale: output size divided by LR size.
     """
-    p = _output_pixels(motion_jittered_px.shape, scale)
+    p = _output_pixels(motion_jittered_px.shape, scale, motion_jittered_px.dtype)
     now, before = _at_pixels(jitter_px), _at_pixels(previous_jitter_px)
     return SamplePositions(
         current=p - now,  # eq. 1; new_uv
@@ -215,7 +216,7 @@ def positions_from_motion(
         previous_jitter_px: J_{t-1} in LR pixels.
         scale: output size divided by LR size.
     """
-    p = _output_pixels(motion_px.shape, scale)
+    p = _output_pixels(motion_px.shape, scale, motion_px.dtype)
     return SamplePositions(
         current=p - _at_pixels(jitter_px),  # eq. 1; cur_uv
         previous=p - motion_px - _at_pixels(previous_jitter_px),  # eq. 4; pre_uv

@@ -1,9 +1,9 @@
 """Where history can be trusted: masks that are 1 where valid and 0 in holes, and ExtraSS' blend mask.
 
-Masks are float32 `[..., H, W, 1]`, exactly 0 or 1, and carry no gradient. They are those of ExtraNet
-(Guo et al. 2021): a change of object, for moving objects a change of normal, for static ones the distance
-in world space to the nearest of the four bilinear taps; and a test of depth alone, where no camera is known.
-Where the origin of a pixel lies outside the previous image it is a hole; sky matches sky alone.
+Masks are `[..., H, W, 1]` in the dtype of the first argument, exactly 0 or 1, and carry no gradient. The
+tests are those of ExtraNet (Guo et al. 2021): a change of object, for moving objects a change of normal, for
+static ones the distance in world space to the nearest of the four bilinear taps; and a test of depth alone,
+where no camera is known. A pixel that comes from outside the previous image is a hole. Sky only matches sky.
 
 Motion is backward, in pixels of its own image, between the two images as they are: for jittered G-buffers
 pass `jitter.jittered_motion`, except to `disocclusion_mask`, which takes the jitters and does it itself.
@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, GBuffer
 from jaxsr.ops._batch import over_batch
-from jaxsr.ops.geometry import camera_motion, looked_at, rotate, view_from_view, view_rays
+from jaxsr.ops.geometry import camera_motion, rotate, unjittered_positions, view_from_view, view_rays
 from jaxsr.ops.jitter import jittered_motion
 from jaxsr.ops.resampling import gather_pixels, pixel_grid, upsample
 from jaxsr.ops.warping import backward_warp
@@ -27,8 +27,8 @@ from jaxsr.ops.warping import backward_warp
 _MIN_WEIGHT = 0.01
 
 
-def _as_mask(valid: Array) -> Array:
-    return valid.astype(jnp.float32)
+def _as_mask(valid: Array, like: Array) -> Array:
+    return valid.astype(like.dtype)
 
 
 def _dot(a: Array, b: Array) -> Array:
@@ -54,7 +54,9 @@ def _in_frame(positions: Array, height: int, width: int) -> Array:
 def _taps(positions: Array, height: int, width: int) -> list[tuple[Array, Array, Array]]:
     """The four bilinear taps: clamped x, y, and whether the tap counts."""
     safe = jnp.clip(
-        jnp.nan_to_num(positions, nan=-4.0), -4.0, jnp.array([width + 3.0, height + 3.0])[None, None]
+        jnp.nan_to_num(positions, nan=-4.0),
+        -4.0,
+        jnp.array([width + 3.0, height + 3.0], positions.dtype)[None, None],
     )
     base = jnp.floor(safe)
     fraction = safe - base
@@ -79,7 +81,7 @@ def stencil_mask(
         object_id: whole numbers, 0 for sky.
         warped_previous_object_id: the previous object numbers, warped with "nearest" (numbers do not mix).
     """
-    return _as_mask(jnp.abs(object_id - warped_previous_object_id) < 0.5)
+    return _as_mask(jnp.abs(object_id - warped_previous_object_id) < 0.5, object_id)
 
 
 @functools.partial(jax.jit, static_argnames=("threshold",))
@@ -95,7 +97,7 @@ def normal_mask(
         warped_normal: those of the previous frame, warped, likewise.
         threshold: smallest cosine.
     """
-    return _as_mask(_cosine(normal, warped_normal) >= threshold)
+    return _as_mask(_cosine(normal, warped_normal) >= threshold, normal)
 
 
 @functools.partial(jax.jit, static_argnames=("tolerance",))
@@ -120,13 +122,13 @@ def depth_mask(
 
     def one(depth: Array, previous: Array, motion: Array) -> Array:
         height, width, _ = depth.shape
-        positions = pixel_grid(height, width) - motion
+        positions = pixel_grid(height, width, motion.dtype) - motion
         valid = jnp.zeros(depth.shape, bool)
         for x, y, counts in _taps(positions, height, width):
             tap = gather_pixels(previous, x, y)
             near = (tap == depth) | (jnp.abs(tap - depth) <= tolerance * jnp.minimum(tap, depth))
             valid |= counts & near
-        return _as_mask(valid & _in_frame(positions, height, width))
+        return _as_mask(valid & _in_frame(positions, height, width), depth)
 
     return over_batch(one, depth_linear, previous_depth_linear, motion_px)
 
@@ -179,27 +181,27 @@ def position_mask(
         height, width, _ = depth.shape
         size = (height, width)
         hit = jnp.isfinite(depth)
-        rays = view_rays(looked_at(size, jitter), camera, size)
+        rays = view_rays(unjittered_positions(size, jitter, depth.dtype), camera, size)
         if normal is None:
             slant: Array | float = 0.5
         else:
             slant = jnp.abs(_cosine(normal, rotate(jnp.asarray(camera.world_from_view)[:3, :3], rays)))
-        pixel = 2 * jnp.max(camera.tan_half_fov / jnp.array([width, height], jnp.float32))
+        pixel = 2 * jnp.max(camera.tan_half_fov / jnp.array([width, height], camera.tan_half_fov.dtype))
         threshold = tolerance * pixel * jnp.where(hit, depth, 1.0) / jnp.maximum(slant, 1 / 8)
         # Distances are the same in the previous view space, where a tap is its depth times its ray.
         turn, shift = view_from_view(camera, before)
         point = rotate(turn, rays * jnp.where(hit, depth, 1.0)) + shift[None, None]
-        positions = pixel_grid(height, width) - motion
+        positions = pixel_grid(height, width, motion.dtype) - motion
         valid = jnp.zeros(depth.shape, bool)
         for x, y, counts in _taps(positions, height, width):
             tap = gather_pixels(previous, x, y)
             tap_hit = jnp.isfinite(tap)
-            looked = jnp.stack([x, y], axis=-1).astype(jnp.float32)
-            looked = looked if jitter_before is None else looked + jitter_before[None, None]
-            offset = jnp.where(tap_hit, tap, 1.0) * view_rays(looked, before, size) - point
+            seen = jnp.stack([x, y], axis=-1).astype(point.dtype)
+            seen = seen if jitter_before is None else seen + jitter_before[None, None]
+            offset = jnp.where(tap_hit, tap, 1.0) * view_rays(seen, before, size) - point
             near = _dot(offset, offset) <= threshold * threshold
             valid |= counts & (tap_hit == hit) & (near | ~hit)
-        return _as_mask(valid & _in_frame(positions, height, width))
+        return _as_mask(valid & _in_frame(positions, height, width), depth)
 
     return over_batch(
         one,
@@ -253,7 +255,7 @@ def disocclusion_mask(
     if jitter_px is not None and previous_jitter_px is not None:
         motion = jittered_motion(motion, jitter_px, previous_jitter_px)
     height, width = motion.shape[-3:-1]
-    positions = jnp.broadcast_to(pixel_grid(height, width), motion.shape) - motion
+    positions = jnp.broadcast_to(pixel_grid(height, width, motion.dtype), motion.shape) - motion
     static_motion = camera_motion(gbuffer.depth_linear, camera, previous_camera, jitter_px)
     off = gbuffer.motion_px - static_motion
     moving = _dot(off, off) > moving_px**2
@@ -274,7 +276,9 @@ def disocclusion_mask(
         same_normal = normal_mask(
             gbuffer.normal, backward_warp(previous.normal, motion, mode="nearest"), threshold
         )
-    mask = jnp.where(moving, same_normal, same_place) * _as_mask(_in_frame(positions, height, width))
+    mask = jnp.where(moving, same_normal, same_place) * _as_mask(
+        _in_frame(positions, height, width), same_place
+    )
     if gbuffer.object_id is not None and previous.object_id is not None:
         mask *= stencil_mask(gbuffer.object_id, backward_warp(previous.object_id, motion, mode="nearest"))
     return mask
@@ -332,4 +336,4 @@ def blend_mask(
     image, base_color, normal = jax.lax.stop_gradient((image, base_color, normal))
     similarity = (1 - norm(up_base - base_color) / 3**0.5) * _cosine(up_normal, normal)
     different = norm(up_image - image) > delta_different * norm(up_image)
-    return _as_mask((similarity > delta_similar) & different)
+    return _as_mask((similarity > delta_similar) & different, image)

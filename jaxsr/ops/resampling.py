@@ -15,6 +15,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int
 
 from jaxsr.errors import JaxsrError
@@ -156,10 +157,10 @@ def sample(
     return over_batch(one, image, positions_px)
 
 
-def pixel_grid(height: int, width: int) -> Float[Array, "h w 2"]:
-    """The position (x, y) of every pixel, in pixels, float32: (0, 0) is the centre of the top left one."""
-    y, x = jnp.mgrid[:height, :width]
-    return jnp.stack([x, y], axis=-1).astype(jnp.float32)
+def pixel_grid(height: int, width: int, dtype: DTypeLike = jnp.float32, xnp=jnp) -> Float[Array, "h w 2"]:
+    """The position (x, y) of every pixel, in pixels: (0, 0) is the centre of the top left one."""
+    y, x = xnp.mgrid[:height, :width]
+    return xnp.stack([x, y], axis=-1).astype(dtype)
 
 
 def _resize_axis(image: Array, size: int, axis: int, mode: str) -> Array:

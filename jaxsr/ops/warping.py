@@ -103,8 +103,8 @@ def warp_zero_upsampled(
             return jnp.zeros((h2, w2, image.shape[-1]), image.dtype)
         dx, fx = _whole_and_fraction(-motion[..., 0], w2, "floor")
         dy, fy = _whole_and_fraction(-motion[..., 1], h2, "floor")
-        column = _sample_tap(jnp.arange(w2)[None, :] + dx - offset[0], fx, w, scale)
-        row = _sample_tap(jnp.arange(h2)[:, None] + dy - offset[1], fy, h, scale)
+        column = _sample_tap(jnp.arange(w2, dtype=jnp.int32)[None, :] + dx - offset[0], fx, w, scale)
+        row = _sample_tap(jnp.arange(h2, dtype=jnp.int32)[:, None] + dy - offset[1], fy, h, scale)
         return weigh_taps(image, [column], [row])
 
     return over_batch(warp, image, motion_px, offset)
@@ -217,7 +217,7 @@ def occlusion_motion(
         h, w, _ = motion.shape
         origin = _origin(motion)
         winner = _nearest_arrival(origin, depth)[jnp.minimum(origin, h * w - 1)]
-        chosen = jnp.where(origin < h * w, winner, jnp.arange(h * w))
+        chosen = jnp.where(origin < h * w, winner, jnp.arange(h * w, dtype=jnp.int32))
         return motion.reshape(-1, 2)[chosen].reshape(h, w, 2)
 
     return over_batch(occlude, motion_px, depth_linear)
@@ -251,8 +251,8 @@ def _warp(image: Array, motion: Array, *, mode: str, boundary: str) -> Array:
     rounding: Literal["floor", "round"] = "round" if mode == "nearest" else "floor"
     dx, fx = _whole_and_fraction(-motion[..., 0], w, rounding)
     dy, fy = _whole_and_fraction(-motion[..., 1], h, rounding)
-    columns = axis_taps(jnp.arange(w)[None, :] + dx, fx, w, mode, boundary)
-    rows = axis_taps(jnp.arange(h)[:, None] + dy, fy, h, mode, boundary)
+    columns = axis_taps(jnp.arange(w, dtype=jnp.int32)[None, :] + dx, fx, w, mode, boundary)
+    rows = axis_taps(jnp.arange(h, dtype=jnp.int32)[:, None] + dy, fy, h, mode, boundary)
     return weigh_taps(image, columns, rows)
 
 
@@ -277,7 +277,7 @@ def _origin(motion: Float[Array, "h w 2"]) -> Int[Array, " n"]:
     h, w, _ = motion.shape
     dx, _ = _whole_and_fraction(-motion[..., 0], w, "round")
     dy, _ = _whole_and_fraction(-motion[..., 1], h, "round")
-    x, y = jnp.arange(w)[None, :] + dx, jnp.arange(h)[:, None] + dy
+    x, y = jnp.arange(w, dtype=jnp.int32)[None, :] + dx, jnp.arange(h, dtype=jnp.int32)[:, None] + dy
     inside = (x >= 0) & (x < w) & (y >= 0) & (y < h)
     return jnp.where(inside, y * w + x, h * w).reshape(-1)
 
@@ -290,4 +290,4 @@ def _nearest_arrival(target: Int[Array, " n"], depth: Float[Array, "h w 1"]) -> 
     nearest = jnp.full(n, jnp.inf, z.dtype).at[target].min(z, mode="drop")
     wins = z == nearest.at[target].get(mode="fill", fill_value=jnp.nan)
     arrivals = jnp.where(wins, target, n)
-    return jnp.full(n, n).at[arrivals].min(jnp.arange(n), mode="drop")
+    return jnp.full(n, n, jnp.int32).at[arrivals].min(jnp.arange(n, dtype=jnp.int32), mode="drop")
