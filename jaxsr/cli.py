@@ -88,16 +88,18 @@ def compare(
     exposure: float | None = None,
     fps: float = 4.0,
     lpips: bool = True,
+    lpips_alex: bool = False,
 ) -> None:
     """Measure folders of frames against the truth and write the comparison page.
 
     Args:
-        folders: one a method: PNG (as shown) or EXR (linear colour) frames, matched by number.
+        folders: one per method: PNG (as shown) or EXR (linear colour) frames, matched by number.
         truth: the true frames; a sequence will do.
         out: folder for the page and the metrics.
         exposure: factor on linear colour before the tone map; that of the truth, else 1.
         fps: speed at which the page plays at first.
         lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes most of the time.
+        lpips_alex: measure LPIPS over AlexNet too, which no network is trained with.
     """
     from rich.console import Console
 
@@ -114,7 +116,7 @@ def compare(
             exposure=exposure,
             fps=fps,
             meta=description(),
-            keys=metrics_with(lpips),
+            keys=metrics_with(lpips, lpips_alex),
             progress=progress,
         )
     for table in rich_tables([section]):
@@ -138,7 +140,8 @@ def upscale(
         scale: of the low-resolution frames to start from; 0 takes the largest there is, 1 takes the
             high-resolution frames and makes only those between.
         every: every n-th frame counts as rendered; the others are extrapolated.
-        out: folder for `exr/` (linear) and `png/` (as shown).
+        out: folder for `exr/` (linear), `png/` (as shown) and run.json; frames of another run are not
+            mixed in.
     """
     from jaxsr.io.sequence import Sequence
     from jaxsr.runtime.load import find_method
@@ -160,27 +163,29 @@ def upscale(
 @app.command
 def evaluate(
     sequences: Positional[tuple[Path, ...]],
-    methods: str = "bicubic,taau,guided-taau,fusion-sr",
+    methods: tuple[str, ...] = ("bicubic", "taau", "guided-taau", "fusion-sr"),
     scale: int = 4,
     every: int = 1,
     frames: Annotated[str | None, tyro.conf.arg(metavar="A:B")] = None,
     warmup: int = 0,
     lpips: bool = True,
+    lpips_alex: bool = False,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("jaxsr-evaluation"),
 ) -> None:
     """Run methods over sequences and measure them: tables, the comparison page, metrics of every frame.
 
     Each metric is over all pixels, over edges, and over disocclusions. What is finished is kept: an
-    interrupted evaluation goes on when it is run again.
+    interrupted evaluation goes on when the same command is run again.
 
     Args:
         sequences: folders of sequences with truth, or folders that hold such folders.
-        methods: names, or files of weights (*.safetensors), with commas between.
+        methods: names, or files of weights (*.safetensors), with spaces between.
         scale: of the low-resolution frames to start from.
         every: every n-th frame counts as rendered; the others are extrapolated.
         frames: first and last frame; all by default.
-        warmup: so many frames at the start of each sequence are made, and not measured.
+        warmup: number of frames at the start of each sequence that are made and not measured.
         lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes most of the time.
+        lpips_alex: measure LPIPS over AlexNet too, which no network is trained with.
         out: folder for everything that is made.
     """
     from rich.console import Console
@@ -191,11 +196,11 @@ def evaluate(
     from jaxsr.evaluation.running import Settings
     from jaxsr.report.tables import rich_tables
 
-    settings = Settings(scale, every, warmup, metrics_with(lpips))
+    settings = Settings(scale, every, warmup, metrics_with(lpips, lpips_alex))
     with Bars() as progress:
         sections = evaluate_methods(
             sequences,
-            [name.strip() for name in methods.split(",") if name.strip()],
+            _split_commas(methods, "--methods"),
             out,
             settings,
             frames=_frame_range(frames),
@@ -297,6 +302,18 @@ def _train() -> None:
     """Train the network of a method: `jaxsr train fusion-sr --help` lists the options."""
     # `main` passes everything after "train" on: which options there are depends on the method's name.
     raise JaxsrError("no method to train", where="jaxsr train", fix="see jaxsr train --help")
+
+
+def _split_commas(values: tuple[str, ...], option: str) -> list[str]:
+    """A list as earlier versions took it, with commas between; a line on stderr says how to write it now."""
+    parts: list[str] = []
+    for value in values:
+        whole = "," not in value or Path(value).exists()
+        parts += [value] if whole else [part.strip() for part in value.split(",") if part.strip()]
+    if parts != list(values):
+        note = f"{option} takes a list with spaces; the next version does not read commas"
+        print(f"jaxsr: note: {note}", file=sys.stderr)
+    return parts
 
 
 def _frame_range(text: str | None) -> tuple[int, int] | None:

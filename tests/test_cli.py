@@ -94,7 +94,7 @@ def test_a_file_of_weights_is_a_method(capsys, sequence, tmp_path):
     weights = random_weights(tmp_path / "mine.safetensors", scale=2)
     out = tmp_path / "out"
     status, text, _ = run(
-        capsys, "evaluate", sequence.path, "--methods", f"nearest, {weights}", "--scale", 2, "--no-lpips",
+        capsys, "evaluate", sequence.path, "--methods", "nearest", weights, "--scale", 2, "--no-lpips",
         "--every", 2, "--warmup", 1, "-o", out,
     )  # fmt: skip
     assert status == 0
@@ -184,9 +184,8 @@ def test_upscale_arguments(capsys, sequence, tmp_path, arguments, expected):
 @pytest.mark.parametrize(
     ("arguments", "expected"),
     [
-        (["--methods", "taau,magic"], "unknown method 'magic'"),
-        (["--methods", "taau,taau"], "two methods are called 'taau'"),
-        (["--methods", " , "], "no methods to evaluate"),
+        (["--methods", "taau", "magic"], "unknown method 'magic'"),
+        (["--methods", "taau", "taau"], "two methods are called 'taau'"),
         (["--methods", "fusion-sr"], "no weights of 'fusion-sr' for scale 2"),
         (["--methods", "none.safetensors"], "none.safetensors: no such file of weights"),
         (["--methods", "text.safetensors"], "text.safetensors: cannot read the weights"),
@@ -205,6 +204,30 @@ def test_evaluate_arguments(capsys, sequence, tmp_path, monkeypatch, arguments, 
     command = ("evaluate", sequence.path, "--scale", "2", "-o", tmp_path / "out", *arguments)
     assert expected in error_line(capsys, *command)
     assert not (tmp_path / "out").exists()
+
+
+def test_lists_with_commas_still_work_and_say_so(capsys, sequence, tmp_path):
+    """As earlier versions took them; a path with a comma is one path."""
+    command = ("evaluate", sequence.path, "--scale", 2, "-o", tmp_path / "out")
+    status, _, err = run(capsys, *command, "--methods", "nearest, magic")
+    assert status == 2
+    note, error = (line for line in err.splitlines() if line.startswith("jaxsr: "))
+    assert "--methods takes a list with spaces" in note
+    assert "unknown method 'magic'" in error
+    (tmp_path / "a,b.safetensors").write_text("these are no weights")
+    assert "a,b.safetensors: " in error_line(capsys, *command, "--methods", tmp_path / "a,b.safetensors")
+
+
+@pytest.mark.parametrize("name", ["report.html", "metrics.json", "metrics.md"])
+@pytest.mark.parametrize("verb", ["evaluate", "compare", "demo"])
+def test_results_of_others_are_not_overwritten(capsys, sequence, tmp_path, name, verb):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / name).write_text('{"mine": 1}')
+    arguments = {"evaluate": (sequence.path, "--scale", 2), "compare": (tmp_path, "--truth", sequence.path)}
+    line = error_line(capsys, verb, *arguments.get(verb, ()), "-o", out)
+    assert f"holds {name}, which jaxsr did not write" in line
+    assert (out / name).read_text() == '{"mine": 1}'
 
 
 def test_evaluate_wants_sequences(capsys, tmp_path):

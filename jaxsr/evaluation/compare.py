@@ -28,7 +28,7 @@ from jaxsr.ops.color import to_display
 from jaxsr.progress import Advance, Progress, silent
 from jaxsr.report.page import write_report
 from jaxsr.report.results import MethodResult, SequenceResult
-from jaxsr.report.tables import write_metrics
+from jaxsr.report.tables import check_results_folder, write_metrics
 
 _PLAIN = (".png", ".jpg", ".jpeg")
 _INNER = ("exr", "png")
@@ -81,37 +81,37 @@ def _images(folder: Path) -> list[Path]:
     return sorted(f for f in folder.iterdir() if f.suffix.lower() in kinds and not f.name.startswith("."))
 
 
-def check_match(found: Frames, truth: Frames) -> None:
+def check_match(frames: Frames, truth: Frames) -> None:
     """See that a folder has exactly the frames of the truth.
 
     Raises:
         JaxsrError: it has others, with both counts and the first frame that is missing.
     """
-    counts = {"expected": f"{len(truth.files)} frames", "found": f"{len(found.files)} frames"}
-    if found.numbers is not None and truth.numbers is not None:
-        missing = sorted(set(truth.numbers) - set(found.numbers))
-        extra = sorted(set(found.numbers) - set(truth.numbers))
+    counts = {"expected": f"{len(truth.files)} frames", "found": f"{len(frames.files)} frames"}
+    if frames.numbers is not None and truth.numbers is not None:
+        missing = sorted(set(truth.numbers) - set(frames.numbers))
+        extra = sorted(set(frames.numbers) - set(truth.numbers))
         if missing:
             file = truth.files[truth.numbers.index(missing[0])].name
             what = f"frame {missing[0]} is missing (truth: {file})"
-            raise JaxsrError(what, where=found.folder, **counts, fix=_renumber(found, truth))
+            raise JaxsrError(what, where=frames.folder, **counts, fix=_renumber(frames, truth))
         if extra:
-            file = found.files[found.numbers.index(extra[0])].name
-            raise JaxsrError(f"frame {extra[0]} ({file}) has no truth", where=found.folder, **counts)
-    elif len(found.files) != len(truth.files):
-        shorter, longer = sorted((found, truth), key=lambda f: len(f.files))
+            file = frames.files[frames.numbers.index(extra[0])].name
+            raise JaxsrError(f"frame {extra[0]} ({file}) has no truth", where=frames.folder, **counts)
+    elif len(frames.files) != len(truth.files):
+        shorter, longer = sorted((frames, truth), key=lambda f: len(f.files))
         first = longer.files[len(shorter.files)].name
         place = "truth" if shorter is truth else "folder"
         raise JaxsrError(
-            f"unequal numbers of frames, the {place} has none for {first}", where=found.folder, **counts
+            f"unequal numbers of frames, the {place} has none for {first}", where=frames.folder, **counts
         )
 
 
-def _renumber(found: Frames, truth: Frames) -> str | None:
-    if len(found.files) != len(truth.files) or found.numbers is None or truth.numbers is None:
+def _renumber(frames: Frames, truth: Frames) -> str | None:
+    if len(frames.files) != len(truth.files) or frames.numbers is None or truth.numbers is None:
         return None
     return (
-        f"files are numbered from {found.numbers[0]}, those of the truth from {truth.numbers[0]}: "
+        f"files are numbered from {frames.numbers[0]}, those of the truth from {truth.numbers[0]}: "
         "rename them if they show the same frames"
     )
 
@@ -153,15 +153,21 @@ def read_display(path: Path, exposure: float) -> np.ndarray:
 
 
 def _starts(truth: Frames) -> list[bool]:
-    """True where a frame does not follow the one before it: a gap in the numbers, or a cut of a sequence."""
+    """True where a frame does not follow the one before it: a gap in the numbers, or a cut of a sequence.
+
+    A frame follows the one before it if its number is one more, or more by the most common step of the
+    folder (the smallest of them, where several are as common).
+    """
     if truth.numbers is None:
         return [i == 0 for i in range(len(truth.files))]
     steps = np.diff(truth.numbers)
-    found = [True, *(bool(s != steps.min()) for s in steps)]
+    values, counts = np.unique(steps, return_counts=True)
+    usual = {1, int(values[np.argmax(counts)])} if len(steps) else {1}
+    starts = [True, *(int(step) not in usual for step in steps)]
     if (truth.folder / "sequence.json").is_file():
         cuts = {info.index for info in FrameSequence.open(truth.folder).infos if info.reset}
-        found = [start or n in cuts for start, n in zip(found, truth.numbers, strict=True)]
-    return found
+        starts = [start or n in cuts for start, n in zip(starts, truth.numbers, strict=True)]
+    return starts
 
 
 def compare(
@@ -180,7 +186,7 @@ def compare(
     """Measure folders of frames against the truth; write report.html, metrics.json, .csv and .md into `out`.
 
     Args:
-        folders: one a method; see the module for what a folder may be.
+        folders: one per method; see the module for what a folder may be.
         truth: the true frames.
         out: where the results go; made if it is not there.
         exposure: factor on linear colour before the tone map; by default that of the truth if it is a
@@ -204,19 +210,18 @@ def compare(
     if not folders:
         raise JaxsrError("no folders to compare", fix="name at least one folder of frames")
     truth, out = Path(truth), Path(out)
-    if out.exists() and not out.is_dir():
-        raise JaxsrError("not a folder", where=out, fix="choose another --out")
+    check_results_folder(out, "frames", "truth")
     true = find_frames(truth)
     kind = "png" if true.files[0].suffix.lower() in _PLAIN else "exr"
-    found = [find_frames(Path(folder), prefer=kind) for folder in folders]
+    given = [find_frames(Path(folder), prefer=kind) for folder in folders]
     names = labels([Path(folder) for folder in folders])
-    for frames in found:
+    for frames in given:
         check_match(frames, true)
     if exposure is None:
         is_sequence = (truth / "sequence.json").is_file()
         exposure = FrameSequence.open(truth).exposure if is_sequence else 1.0
     starts = _starts(true)
-    advance = progress("measuring", len(found) * len(true.files))
+    advance = progress("measuring", len(given) * len(true.files))
     title = title or f"{' · '.join(names)} against {truth.resolve().name}"
     with _staging(out) as folder:
         shown = _Shown(folder, exposure)
@@ -226,7 +231,7 @@ def compare(
             truths=[shown.path("truth", file) for file in true.files],
             methods=[
                 _measured(name, frames, true, starts, shown, Meter(keys), advance)
-                for name, frames in zip(names, found, strict=True)
+                for name, frames in zip(names, given, strict=True)
             ],
             exposure=exposure,
             meta={"truth": str(truth), **{name: str(f) for name, f in zip(names, folders, strict=True)}},
@@ -242,7 +247,7 @@ def compare(
         truths=[shown.path("truth", file) for file in true.files],
         methods=[
             dataclasses.replace(result, images=[shown.path(f"frames/{name}", file) for file in frames.files])
-            for result, name, frames in zip(section.methods, names, found, strict=True)
+            for result, name, frames in zip(section.methods, names, given, strict=True)
         ],
     )
 

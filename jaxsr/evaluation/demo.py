@@ -14,7 +14,7 @@ from jaxsr.provenance import provenance
 from jaxsr.report.embedding import to_bytes
 from jaxsr.report.page import write_report
 from jaxsr.report.results import SequenceResult
-from jaxsr.report.tables import write_metrics
+from jaxsr.report.tables import check_results_folder, write_metrics
 from jaxsr.report.video import write_video
 from jaxsr.runtime.load import find_method, shipped_scales
 
@@ -50,6 +50,7 @@ def run_demo(
     Raises:
         JaxsrError: a sequence cannot be read or lacks the scale.
     """
+    check_results_folder(out)
     opened = [FrameSequence.open(path) for path in sequences]
     upscalers = (*UPSCALERS, LEARNED) if scale in shipped_scales(LEARNED) else UPSCALERS
     rivals = ("taau", LEARNED) if LEARNED in upscalers else ("bilinear", "guided-taau")
@@ -74,8 +75,8 @@ def run_demo(
             )
     meta = description(scale=scale)
     advance = progress("page", 1)
-    write_report(out / "report.html", sections, title="jaxsr demo", meta=meta)
     write_metrics(out, sections, title="jaxsr demo", meta=meta)
+    write_report(out / "report.html", sections, title="jaxsr demo", meta=meta)
     advance()
     advance = progress("videos", len(sections))
     shown = [(sequence, task) for sequence in opened for task in tasks]

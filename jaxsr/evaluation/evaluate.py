@@ -20,7 +20,7 @@ from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.progress import Progress
 from jaxsr.report.page import write_report
 from jaxsr.report.results import SequenceResult
-from jaxsr.report.tables import write_metrics
+from jaxsr.report.tables import check_results_folder, write_metrics
 from jaxsr.runtime.load import LoadedMethod, find_method
 from jaxsr.runtime.schedule import check_needs
 
@@ -109,8 +109,7 @@ def evaluate(
     Raises:
         JaxsrError: see `find_sequences`, `find_methods`, `part`, `check_needs`, `run_methods`.
     """
-    if out.exists() and not out.is_dir():
-        raise JaxsrError("not a folder", where=out, fix="choose another --out")
+    check_results_folder(out)
     loaded = find_methods(methods, settings.scale)
     paths = find_sequences(places)
     names = labels(paths)
@@ -130,7 +129,7 @@ def evaluate(
         for name, sequence in zip(names, sequences, strict=True)
     ]
     advance = progress("page", 1)
-    write_report(out / "report.html", sections, title=title, meta=meta)
     write_metrics(out, sections, title=title, meta=meta)
+    write_report(out / "report.html", sections, title=title, meta=meta)
     advance()
     return sections

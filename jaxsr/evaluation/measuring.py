@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsr.evaluation.regions import regions
 from jaxsr.io.sequence import Sequence as FrameSequence
-from jaxsr.metrics import available, flip_map, measure_frame
+from jaxsr.metrics import METRICS, available, flip_map, measure_frame
 from jaxsr.report.embedding import ImageOrPath, flip_jpeg
 from jaxsr.report.results import ALL, MethodResult
 from jaxsr.runtime.cost import Cost, Timing
@@ -19,9 +19,15 @@ CACHE_BYTES = 256e6
 """How much of the truth a `Reference` keeps."""
 
 
-def metrics_with(lpips: bool) -> tuple[str, ...]:
-    """The metrics that can be computed here, LPIPS among them (if its extra is installed) or not."""
-    return tuple(key for key in available() if lpips or key != "lpips")
+def metrics_with(lpips: bool, lpips_alex: bool = False) -> tuple[str, ...]:
+    """The metrics to measure, in the order of `jaxsr.metrics.METRICS`.
+
+    Args:
+        lpips: LPIPS over VGG-16 too, if its extra is installed.
+        lpips_alex: LPIPS over AlexNet too; `measure_frame` raises an error where its extra is not installed.
+    """
+    wanted = {*available(), *(("lpips_alex",) if lpips_alex else ())}
+    return tuple(key for key in METRICS if key in wanted and (lpips or key != "lpips"))
 
 
 class Truth(NamedTuple):

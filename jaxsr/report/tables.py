@@ -23,10 +23,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path
+from jaxsr.files import atomic_path, read_json
 from jaxsr.metrics import METRICS
 from jaxsr.report.results import ALL, MethodResult, SequenceResult, Values
 from jaxsr.runtime.cost import Cost, Timing
+
+FORMAT = "jaxsr-metrics"
 
 
 @dataclass(frozen=True)
@@ -355,7 +357,7 @@ def as_json(
     definitions = {k: m._asdict() for k, m in METRICS.items()}
     return json_value(
         {
-            "format": "jaxsr-metrics",
+            "format": FORMAT,
             "version": 1,
             "title": title,
             "meta": meta or {},
@@ -381,6 +383,32 @@ def as_csv(sections: Sequence[SequenceResult]) -> str:
                     shown = ["" if v is None else repr(float(v)) for v in values]
                     writer.writerow([section.title, result.name, frame, flag, region, *shown])
     return text.getvalue()
+
+
+def check_results_folder(out: Path, *others: str) -> None:
+    """See that no results in a folder are those of another program, before any work is done.
+
+    Args:
+        out: where results go; it may not be there yet.
+        others: names in it that will be written beside the page and the metrics.
+
+    Raises:
+        JaxsrError: not a folder; a file of the name of a result, without a metrics.json of jaxsr beside it.
+    """
+    fix = "choose another folder with --out"
+    if out.exists() and not out.is_dir():
+        raise JaxsrError("not a folder", where=out, fix=fix)
+    names = ("metrics.json", "report.html", "metrics.csv", "metrics.md", *others)
+    there = [name for name in names if (out / name).exists()]
+    if there and not _is_metrics(out / "metrics.json"):
+        raise JaxsrError(f"holds {there[0]}, which jaxsr did not write", where=out, fix=fix)
+
+
+def _is_metrics(path: Path) -> bool:
+    try:
+        return path.is_file() and read_json(path, dict).get("format") == FORMAT
+    except JaxsrError:
+        return False
 
 
 def write_metrics(

@@ -126,6 +126,22 @@ def test_matching_by_number_by_name_and_with_gaps(folders):
     assert section.methods[0].metrics["psnr"] == [math.inf] * 2
 
 
+@pytest.mark.parametrize(
+    ("numbers", "follows"),
+    [
+        ((1, 3, 5, 7), [False, True, True, True]),  # every second frame
+        ((1, 3, 5, 6, 8, 20), [False, True, True, True, True, False]),  # one frame between, then a gap
+        ((1, 2, 3, 5, 6), [False, True, True, False, True]),
+        ((7,), [False]),
+    ],
+)
+def test_a_frame_follows_by_one_or_by_the_most_common_step(folders, numbers, follows):
+    for name in ("t", "a"):
+        write_folder(folders / name, numbers=numbers)
+    section = compare([folders / "a"], folders / "t", folders / "out", keys=("tpsnr",))
+    assert [v is not None for v in section.methods[0].metrics["tpsnr"]] == follows
+
+
 def test_what_upscale_writes_is_found(folders):
     write_folder(folders / "method" / "png")
     write_folder(folders / "method" / "exr", kind="exr")
