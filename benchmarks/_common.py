@@ -54,7 +54,12 @@ class Variant(NamedTuple):
     """Pixels of the largest image worth waiting for."""
 
 
-def arguments(description: str | None, sizes: Sequence[str] = SIZES) -> argparse.Namespace:
+def arguments(
+    description: str | None,
+    sizes: Sequence[str] = SIZES,
+    add: Callable[[argparse.ArgumentParser], object] = lambda parser: None,
+) -> argparse.Namespace:
+    """The options that all benchmarks have, and those that `add` adds to the parser."""
     parser = argparse.ArgumentParser(
         description=description, formatter_class=argparse.RawDescriptionHelpFormatter
     )
@@ -62,6 +67,7 @@ def arguments(description: str | None, sizes: Sequence[str] = SIZES) -> argparse
     parser.add_argument("--rounds", type=int, default=15, help="timed calls of each variant")
     parser.add_argument("--quick", action="store_true", help="one small size, three rounds, nothing written")
     parser.add_argument("--memory", nargs=3, metavar=("QUESTION", "VARIANT", "SIZE"), help=argparse.SUPPRESS)
+    add(parser)
     args = parser.parse_args()
     if args.quick:
         args.sizes, args.rounds = ["160x90"], 3

@@ -1,10 +1,12 @@
 """The guided reprojection at the paper's defaults (33 candidates, 4 kept), with 6 guide and 3 value channels.
 
-    python -m benchmarks.reproject [--quick]
+    python -m benchmarks.reproject [--quick] [--forms] [--batch 4]
 
 Ours against a plain numba loop over pixels (all cores, fast-math), against the plain JAX form of the tests
 (per-pixel gather, top_k, softmax), and against PyTorch eager (gather of all candidates, topk).
 Questions: the forward pass, forward with the gradient of the previous image, forward with all gradients.
+With `--forms` only the forms of ours are compared, on the default device, a CPU or a GPU. A condition, an
+optimisation barrier or nothing keeps XLA from making copies, and a batch is mapped or vmapped.
 
 Tried for ours (CPU time over numba's, selection alone): winners as four outputs or whole-image keys 1.5-1.8;
 one packed output, planar guides 0.55; the same without signed indices 0.5; whole pixels of guides and where()
@@ -14,6 +16,7 @@ second pass as four arrays takes twice the time of one with the winners as last 
 saves 15 % of the gradient's memory and no time.
 """
 
+import argparse
 import functools
 import importlib.util
 from collections.abc import Callable
@@ -26,7 +29,7 @@ import numpy as np
 from benchmarks import _common
 from benchmarks._common import Inputs, Prepared, Variant
 from jaxsr.ops import reproject
-from jaxsr.ops.reprojection import candidate_offsets
+from jaxsr.ops.reprojection import Batching, Fence, _reproject, candidate_offsets
 from tests.reference.reprojection import reproject_plain
 
 SIGMAS = {"sigma_guide": 0.1, "sigma_space": 1.0}
@@ -47,6 +50,31 @@ def with_jax(name: str, fn: Callable[..., Any], argnums: tuple[int, ...] = (), *
 
     timed = jax.value_and_grad(loss, argnums) if argnums else forward
     return Variant(name, lambda inputs: _common.compiled(timed, inputs), **limits)
+
+
+def in_form(batching: Batching, fence: Fence) -> Callable[..., Any]:
+    def form(*arrays: jax.Array, sigma_guide: float, sigma_space: float) -> Any:
+        sigmas = (sigma_guide, sigma_space)
+        return _reproject(arrays, sigmas, OFFSETS, COUNT, batching=batching, fence=fence)
+
+    return form
+
+
+def compare_forms(batch: int, size: str, rounds: int) -> None:
+    """Print the times of every form for one image and for a batch, forward and with all gradients."""
+    inputs = _common.scene(*_common.parse_size(size))
+    device = jax.devices()[0].device_kind
+    for question, argnums in (("forward", ()), ("all gradients", (0, 1, 2, 3))):
+        for images in (1, batch):
+            arrays = inputs if images == 1 else tuple(np.stack([a] * images) for a in inputs)
+            calls = {
+                f"{batching}, {fence}": with_jax("", in_form(batching, fence), argnums).build(arrays).call
+                for batching in (("vmap",) if images == 1 else ("map", "vmap"))
+                for fence in ("cond", "barrier", "none")
+            }
+            timed = _common.summarise(_common.time_interleaved(calls, rounds), next(iter(calls)))
+            for name, row in timed.items():
+                print(f"{device} {size} x {images} {question}: {name}: {row['median_ms']:.2f} ms", flush=True)
 
 
 @functools.cache
@@ -152,8 +180,17 @@ def with_torch(differentiated: tuple[int, ...] = ()) -> Variant:
     return Variant("PyTorch eager", build, largest=GATHERS_ALL)
 
 
+def add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--forms", action="store_true", help="compare the forms of ours; write nothing")
+    parser.add_argument("--batch", type=int, default=4, help="images of the batch that --forms measures")
+
+
 def main() -> None:
-    args = _common.arguments(__doc__)
+    args = _common.arguments(__doc__, add=add_options)
+    if args.forms:
+        for size in args.sizes:
+            compare_forms(args.batch, size, args.rounds)
+        return
     has = {name: importlib.util.find_spec(name) is not None for name in ("numba", "torch")}
     questions, references = {}, {}
     for question, argnums in (

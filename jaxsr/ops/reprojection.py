@@ -64,7 +64,7 @@ def reproject(
 
     A candidate weighs 0 if it lies outside the frame or has a guide that is not finite. Where no candidate
     is left, or the pixel's own guide or motion is not finite, the result is the previous pixel at [xbar],
-    clamped to the frame (NaN motion: at x), and the confidence is 0.
+    clamped to the frame (for NaN motion: at x), and the confidence is 0.
 
     The confidence is `max over y of w_x(y) / G(xbar - [xbar] | 0, sigma_1)`, in [0, 1]: the weight of the
     best candidate relative to a perfect match at [xbar]. It is 1 where the guide at the motion's end agrees
@@ -245,7 +245,7 @@ def _is_number(motion: Float[Array, "h w 2"]) -> Bool[Array, "h w"]:
 
 
 class _Pixel(NamedTuple):
-    """What all candidates of a pixel share. Cheap: computed in each loop rather than stored between them."""
+    """What all candidates of a pixel share. It is cheap, so each loop computes it again."""
 
     corner: Int[Array, "h w *k"]
     """Index of [xbar] in the padded guide."""

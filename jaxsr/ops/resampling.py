@@ -253,7 +253,7 @@ def zero_upsample(
     Args:
         image: any range, any number of channels; batch axes lead.
         scale: s, the size of a block.
-        offset: (x, y) in [0, s), where in its block the sample sits instead, one an image; the values may be
+        offset: (x, y) in [0, s), where in its block the sample sits instead, one per image; the values may be
             traced. `O[y, x] = I[(y - offset_y) / s, (x - offset_x) / s]`. Out of range, nothing is placed.
 
     Raises:

@@ -1,6 +1,6 @@
 """Backward warping, forward splatting, occlusion motion vectors, and motion over several frames.
 
-All follow the convention of `jaxsr.frames`: motion is backward and in pixels of its own image, so
+All functions follow the convention of `jaxsr.frames`: motion is backward and in pixels of its own image, so
 that the point seen at p lies at `p - motion_px(p)` in the previous frame. Warping reads there; splatting
 writes there. Images are `[H, W, C]` or `[B, H, W, C]`; values have no range, results keep the dtype.
 
@@ -77,7 +77,7 @@ def warp_zero_upsampled(
         image: the samples, any range; NaN and infinity as in `backward_warp`.
         motion_px: backward motion (x, y) in pixels of the result.
         scale: s, size of the result over that of `image`.
-        offset: (x, y) in [0, s), where in its s x s block each sample sits, one an image; else top left.
+        offset: (x, y) in [0, s), where in its s x s block each sample sits, one per image; else top left.
 
     Raises:
         JaxsrError: a scale below 1, or sizes that do not agree.
@@ -114,10 +114,10 @@ def warp_zero_upsampled(
 def compose_motion(
     motion_px: Float[Array, "*b h w 2"], before_px: Float[Array, "*b h w c"]
 ) -> Float[Array, "*b h w c"]:
-    """Motion over one frame more: `out(p) = motion(p) + before(p - motion(p))`, `before` read bilinearly.
+    """Motion over one more frame: `out(p) = motion(p) + before(p - motion(p))`, `before` read bilinearly.
 
     `before` leads from the previous frame to an earlier one, the result from the current frame to that one:
-    an image many frames old is then warped once, and not blurred once a frame (Xiao et al. 2020).
+    an image many frames old is then warped once, and not blurred once per frame (Xiao et al. 2020).
     Where p comes from outside the image, the motion of the border goes on.
 
     Motion is at most 1e6 pixels: infinite motion stays outside any image, but is a number, as interpolation
