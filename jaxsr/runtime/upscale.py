@@ -82,11 +82,11 @@ def write_frames(
 ) -> Iterator[MadeFrame]:
     """Make all frames of a sequence; each is on disk when it is given."""
     frames = stream(loaded.method, frames_in_memory(sequence, scale, every), loaded.net)
-    for info, made in zip(sequence.infos, frames, strict=True):
+    for i, (info, made) in enumerate(zip(sequence.infos, frames, strict=True)):
         half = np.clip(made.image, 0, np.finfo(np.float16).max).astype(np.float16)
         channels = {f"color.{c}": half[..., k] for k, c in enumerate("RGB")}
         write_exr(frame_path(out, "exr", info.index), channels)
-        image = display(made.image, sequence.exposure)
+        image = display(made.image, sequence.exposure_at(i))
         write_png(frame_path(out, "png", info.index), image)
         yield MadeFrame(image, made.seconds, made.compile_seconds, made.cost)
 

@@ -1,22 +1,26 @@
 """jaxsr.io.sequence and jaxsr.io.writing: round trips, resuming, and one clear line for each thing wrong."""
 
 import json
+import os
 import re
 import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from jaxsr.cli import main
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.sequence import FrameInfo, Sequence, SequenceWriter, prefetch
 from jaxsr.io.writing import round_mantissa
 from jaxsr.layers import LAYERS, channels
+from jaxsr.ops.motion import hr_from_lr_on_host
 from tests.builders import frame_info, halton_jitter, make_sequence
 
 SIZE = (32, 24)
@@ -458,3 +462,234 @@ def test_the_table_of_layers_in_the_documentation():
     text = (Path(__file__).parents[2] / "docs/data.md").read_text()
     table = [line for line in text.splitlines() if re.match(r"\| [a-z_]+ \| [a-z_]+\.[A-Z]", line)]
     assert table == [layer_row(layer) for layer in LAYERS.values()]
+
+
+# --- what is needed decides what is read -----------------------------------------------------------------
+
+
+def needs(*buffers):
+    return frozenset(buffers)
+
+
+@pytest.fixture
+def opened(monkeypatch):
+    """The files that are opened for their pixels, as "x2/0001.exr"."""
+    names = []
+
+    def reading(path, **kwargs):
+        names.append(f"{path.parent.name}/{path.name}")
+        return read_exr(path, **kwargs)
+
+    monkeypatch.setattr("jaxsr.io.sequence.read_exr", reading)
+    return names
+
+
+def test_files_of_which_nothing_is_needed_are_not_opened(seq, opened):
+    frame = seq.frame(0, 2, needs=needs("lr.color"))
+    assert frame.lr == frame.hr == (None,) * 7
+    assert frame.color_linear.any()
+    assert opened == ["x2/0001.exr"]
+    opened.clear()
+    frame = seq.frame(0, 2, needs=needs("hr.normal"))
+    assert (frame.hr.normal is not None, frame.lr.normal, frame.color_linear.any()) == (True, None, False)
+    assert frame.color_linear.shape == (12, 16, 3)
+    assert opened == ["hr/0001.exr"]
+    opened.clear()
+    assert not seq.frame(0, 2, rendered=False, needs=needs("lr.color")).color_linear.any()
+    assert opened == []
+    frame = seq.frame(0, 1, needs=needs("lr.color", "hr.depth"))
+    assert (frame.lr.depth_linear, frame.hr.depth_linear.shape) == (None, (24, 32, 1))
+    assert opened == ["hr/0001.exr"]
+    opened.clear()
+    seq.truth(1), seq.lr_color(1, 4)
+    assert opened == ["hr/0002.exr", "x4/0002.exr"]
+    with pytest.raises(JaxsrError, match=r"unknown buffer 'hr\.color'"):
+        seq.frame(0, 2, needs=needs("hr.color"))
+
+
+@pytest.mark.parametrize("fault", ["missing", "lacks a channel", "nan", "no file"])
+def test_what_is_not_needed_may_be_broken(seq, fault):
+    def spoil(channels):
+        if fault == "missing":
+            for k in "XY":
+                channels.pop(f"motion.{k}")
+        elif fault == "lacks a channel":
+            channels.pop("motion.Y")
+        else:
+            channels["motion.X"][:] = np.nan
+
+    if fault == "no file":
+        (seq.path / "hr/0002.exr").unlink()
+    else:
+        change_frame(seq, "hr/0002.exr", spoil)
+        assert seq.frame(1, 2, needs=needs("lr.color", "hr.depth")).hr.depth_linear is not None
+        assert seq.truth(1).shape == (24, 32, 3)
+    assert seq.frame(1, 2, needs=needs("lr.color", "lr.motion")).lr.motion_px is not None
+    words = {"missing": "missing layer", "lacks a channel": "lacks channel 'motion.Y'", "nan": "NaN or Inf"}
+    with pytest.raises(JaxsrError, match=rf"hr/0002\.exr: .*{words.get(fault, 'no such file')}"):
+        seq.frame(1, 2, needs=needs("lr.color", "hr.motion"))
+
+
+@pytest.mark.parametrize("value", [0.0, -1.0])
+def test_depth_must_be_above_zero(seq, value):
+    change_frame(seq, "x2/0002.exr", lambda c: c["depth.Z"].__setitem__((3, 5), value))
+    with pytest.raises(JaxsrError, match=rf"'depth' is not above 0; .*sky is \+inf; .*depth.Z = {value:g}"):
+        seq.frame(1, 2, needs=needs("lr.depth"))
+    seq.frame(1, 2, needs=needs("lr.color"))
+    with pytest.raises(JaxsrError, match=f"frame 1, hr: layer 'depth' is not above 0.*= {value:g}"):
+        writer(seq.path / "w").write_frame(
+            frame_info(1, SIZE), layers(depth=np.full((24, 32, 1), value)), {2: layers(1, 2)}
+        )
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"jitter_px": (0.8, 0.25)}, "jitter of more than half a pixel.*found .0.8, 0.25."),
+        ({"jitter_px": (3, 1e30)}, "jitter of more than half a pixel"),
+        ({"jitter_px": (0, np.nan)}, "bad jitter_px.*finite"),
+        ({"index": -1}, "bad index"),
+        ({"exposure": -1.0}, "bad exposure"),
+        ({"world_from_view": np.diag([2.0, 2, 2, 1])}, "not rigid"),
+        ({"world_from_view": np.eye(3)}, "bad world_from_view; expected 4 x 4"),
+        ({"tan_half_fov": (0.5, np.inf)}, "bad tan_half_fov"),
+        ({"tan_half_fov": None}, "half a camera"),
+    ],
+)
+def test_the_writer_refuses_what_the_reader_would(tmp_path, change, message):
+    info = replace(frame_info(1, SIZE), **change)
+    with pytest.raises(JaxsrError, match=message):
+        writer(tmp_path).write_frame(info, layers(), {2: layers(1, 2)})
+    assert not list(tmp_path.rglob("*.exr"))
+
+
+def test_the_writer_refuses_numbers_that_do_not_fit(tmp_path):
+    for more, message in (
+        ({"depth": np.full((24, 32, 1), 1e-9)}, "'depth' does not fit half precision; found 1e-09"),
+        ({"depth": np.full((24, 32, 1), 1e39)}, "'depth' does not fit half precision"),
+        ({"object_id": np.full((24, 32, 1), -1.0)}, "object_id is out of range"),
+    ):
+        with pytest.raises(JaxsrError, match=message):
+            writer(tmp_path, precision={"depth": "half"}).write_frame(
+                frame_info(1, SIZE), layers(**more), {2: layers(1, 2)}
+            )
+
+
+def test_a_gap_without_a_reset_is_refused_when_the_writer_closes(tmp_path):
+    out = writer(tmp_path, scales=())
+    out.write_frame(frame_info(1, SIZE, reset=True), layers(), {})
+    out.write_frame(frame_info(3, SIZE), layers(3), {})
+    with pytest.raises(JaxsrError, match="frame 3 follows frame 1"):
+        out.close()
+    assert writer(tmp_path, scales=()).has(3), "what was written stays"
+
+
+@pytest.mark.parametrize("kind", ["pipe", "folder"])
+def test_a_frame_that_is_no_file(seq, kind):
+    path = seq.path / "x2/0002.exr"
+    path.unlink()
+    os.mkfifo(path) if kind == "pipe" else path.mkdir()
+    with pytest.raises(JaxsrError, match=r"x2/0002\.exr: is (a folder|not a regular file)"):
+        seq.frame(1, 2)
+
+
+# --- versions --------------------------------------------------------------------------------------------
+
+
+def test_version_1_reads(seq):
+    def old(head):
+        head["version"] = 1
+        del head["hr"]
+        for frame in head["frames"]:
+            frame["cut"] = frame.pop("reset")
+
+    edit(seq, old)
+    again = Sequence.open(seq.path)
+    assert [i.reset for i in again.infos] == [True, False, False]
+    assert again.hr
+    assert again.frame(1, 2).hr.normal is not None
+    more = SequenceWriter(seq.path, name="seq", size=SIZE, scales=(2, 4), license="CC0-1.0")
+    assert more.has(3), "a writer goes on where version 1 was"
+    more.close()
+    assert json.loads((seq.path / "sequence.json").read_text())["version"] == 2
+
+
+def test_exposure_and_camera_of_each_frame(tmp_path):
+    with writer(tmp_path, scales=(), exposure=2.0) as out:
+        out.write_frame(FrameInfo(1, reset=True, exposure=0.5), layers(), {})
+        out.write_frame(frame_info(2, SIZE), layers(2), {})
+    seq = Sequence.open(tmp_path)
+    first, second = (seq.frame(i, 1) for i in (0, 1))
+    assert (float(first.exposure), float(second.exposure)) == (0.5, 2.0)
+    assert first.camera is None
+    assert second.camera is not None
+    assert not first.jitter_px.any()
+    change_frame(seq, "hr/0001.exr", lambda c: [c.pop(f"position.{k}") for k in "XYZ"])
+    with pytest.raises(JaxsrError, match="frame 1 has no camera: positions cannot be rebuilt"):
+        seq.position(0, "hr")
+
+
+# --- sequences without HR images -------------------------------------------------------------------------
+
+
+def only_rendered(name, index, layers):
+    for layer in set(layers) - {"color", "depth", "motion"}:
+        del layers[layer]
+
+
+@pytest.fixture
+def lr_only(tmp_path):
+    return make_sequence(tmp_path / "lr", size=(64, 48), hr=False, spoil=only_rendered)
+
+
+def test_hr_depth_and_motion_are_derived(lr_only, opened):
+    assert (lr_only.hr, lr_only.resolutions, lr_only.size) == (False, ("x2",), (64, 48))
+    frame = lr_only.frame(1, 2, needs=needs("lr.color", "hr.depth", "hr.motion"))
+    lr = lr_only.frame(1, 2).lr
+    depth, motion = hr_from_lr_on_host(lr.depth_linear, lr.motion_px, lr_only.infos[1].jitter_px, 2)
+    np.testing.assert_array_equal(frame.hr.depth_linear, depth)
+    np.testing.assert_array_equal(frame.hr.motion_px, motion)
+    assert frame.lr.depth_linear is None, "it is not needed"
+    assert lr_only.frame(1, 2).hr.motion_px is not None, "without needs, too"
+    opened.clear()
+    lr_only.frame(1, 2, needs=needs("lr.color"))
+    assert opened == ["x2/0002.exr"]
+
+
+def test_what_cannot_be_derived_is_named(lr_only):
+    with pytest.raises(JaxsrError, match=r"missing HR buffers hr\.base_color, hr\.normal; .*derived from LR"):
+        lr_only.frame(0, 2, needs=needs("lr.color", "hr.depth", "hr.normal", "hr.base_color"))
+    with pytest.raises(JaxsrError, match="the sequence has no HR images"):
+        lr_only.truth(0)
+    with pytest.raises(JaxsrError, match=r"scale 1 is not available; expected one of \[2\]"):
+        lr_only.frame(0, 1)
+    change_frame(lr_only, "x2/0002.exr", lambda c: c.pop("depth.Z"))
+    with pytest.raises(JaxsrError, match=r"x2/0002\.exr: frame 2: missing layer 'depth'"):
+        lr_only.frame(1, 2, needs=needs("lr.color", "hr.motion"))
+
+
+def test_hr_truth_without_hr_buffers(tmp_path):
+    """What engines write as training data: a reference, and buffers at render size."""
+
+    def spoil(name, index, layers):
+        for layer in set(layers) - ({"color"} if name == "hr" else {"color", "depth", "motion"}):
+            del layers[layer]
+
+    seq = make_sequence(tmp_path / "seq", size=SIZE, spoil=spoil)
+    assert seq.frame(1, 2, needs=needs("hr.motion")).hr.motion_px.shape == (24, 32, 2)
+    assert seq.truth(1).any()
+
+
+def test_the_writer_is_told_of_sequences_without_hr_images(tmp_path):
+    with pytest.raises(JaxsrError, match="there are no images"):
+        writer(tmp_path, hr=False, scales=(1,))
+    with pytest.raises(JaxsrError, match="wrong HR images; expected None"):
+        writer(tmp_path / "a", hr=False).write_frame(frame_info(1, SIZE), layers(), {2: layers(1, 2)})
+    with pytest.raises(JaxsrError, match="wrong HR images; expected HR layers"):
+        writer(tmp_path / "b").write_frame(frame_info(1, SIZE), None, {2: layers(1, 2)})
+
+
+@pytest.mark.parametrize("method", ["bilinear", "bicubic", "taau"])
+def test_methods_upscale_what_has_no_hr_images(lr_only, tmp_path, method):
+    main(["upscale", str(lr_only.path), "--method", method, "--out", str(tmp_path / "out")])
+    assert len(list((tmp_path / "out/png").glob("*.png"))) == 3
