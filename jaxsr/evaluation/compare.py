@@ -6,7 +6,7 @@ may be a jaxsr sequence (its HR colour counts) or what `jaxsr upscale` wrote (it
 
 Frames are matched by the last number in the file name where all names of a folder have one, else by sorted
 name. Memory does not grow with the number of frames, apart from the small FLIP maps of the page.
-Everything is made in a temporary folder beside `out` and moved at the end: an error leaves `out` as it was.
+All files are made in a temporary folder beside `out` and moved at the end: an error leaves `out` as it was.
 """
 
 import contextlib
@@ -170,6 +170,16 @@ def _starts(truth: Frames) -> list[bool]:
     return starts
 
 
+def _exposures(truth: Frames, exposure: float | None) -> list[float]:
+    """The exposure of each frame: the one that is asked for, that of the true sequence, or 1."""
+    count = len(truth.files)
+    if exposure is not None or not (truth.folder / "sequence.json").is_file():
+        return [1.0 if exposure is None else exposure] * count
+    sequence = FrameSequence.open(truth.folder)
+    of = {info.index: sequence.exposure_at(i) for i, info in enumerate(sequence.infos)}
+    return [of.get(number, sequence.exposure) for number in truth.numbers or [-1] * count]
+
+
 def compare(
     folders: Sequence[Path],
     truth: Path,
@@ -217,14 +227,12 @@ def compare(
     names = labels([Path(folder) for folder in folders])
     for frames in given:
         check_match(frames, true)
-    if exposure is None:
-        is_sequence = (truth / "sequence.json").is_file()
-        exposure = FrameSequence.open(truth).exposure if is_sequence else 1.0
+    exposures = _exposures(true, exposure)
     starts = _starts(true)
     advance = progress("measuring", len(given) * len(true.files))
     title = title or f"{' · '.join(names)} against {truth.resolve().name}"
     with _staging(out) as folder:
-        shown = _Shown(folder, exposure)
+        shown = _Shown(folder, exposures)
         section = SequenceResult(
             title=f"{truth.resolve().name}: {', '.join(names)}" if len(names) < 4 else truth.resolve().name,
             frames=true.numbers or tuple(range(1, len(true.files) + 1)),
@@ -233,7 +241,7 @@ def compare(
                 _measured(name, frames, true, starts, shown, Meter(keys), advance)
                 for name, frames in zip(names, given, strict=True)
             ],
-            exposure=exposure,
+            exposure=exposures[0],
             meta={"truth": str(truth), **{name: str(f) for name, f in zip(names, folders, strict=True)}},
         )
         write_report(
@@ -278,11 +286,12 @@ class _Shown(NamedTuple):
     """Where the page finds a frame: a plain picture as it is, OpenEXR as a PNG made from it."""
 
     out: Path
-    exposure: float
+    exposures: Sequence[float]
+    """Of each frame."""
 
-    def read(self, label: str, file: Path) -> np.ndarray:
+    def read(self, label: str, file: Path, position: int) -> np.ndarray:
         """The display-referred frame; the PNG of an OpenEXR frame is written on the way."""
-        image = read_display(file, self.exposure)
+        image = read_display(file, self.exposures[position])
         path = self.path(label, file)
         if path != file:
             write_png(path, image)
@@ -305,8 +314,8 @@ def _measured(
 ) -> MethodResult:
     """All metrics of a folder, two frames in memory at a time."""
     size: tuple[int, ...] | None = None
-    for file, true_file, start in zip(frames.files, true.files, starts, strict=True):
-        truth, image = shown.read("truth", true_file), shown.read(f"frames/{name}", file)
+    for i, (file, true_file, start) in enumerate(zip(frames.files, true.files, starts, strict=True)):
+        truth, image = shown.read("truth", true_file, i), shown.read(f"frames/{name}", file, i)
         size = size or truth.shape
         for array, path, wanted in ((truth, true_file, size), (image, file, truth.shape)):
             if array.shape != wanted:

@@ -33,11 +33,11 @@ RECORD = "result.json"
 FORMAT = "jaxsr-result"
 KINDS = ("exr", "png", "flip")
 NOT_CODE = ("cli.py", "training", "data", "inspection", "blender", "report/page.py", "report/tables.py")
-"""Of the package, what results do not depend on; who edits a method wants new ones."""
+"""Parts of the package that results do not depend on."""
 
 
 def run_kept(evaluation: Evaluation, loaded: LoadedMethod, out: Path) -> MethodResult:
-    """`run_method`, or what it gave when it was last run with the same settings, code and files.
+    """`run_method`, or its kept result of the same settings, code, files and machine.
 
     Warns:
         UserWarning: the code of the method cannot be told from other code; its results are not kept.

@@ -40,7 +40,7 @@ class Truth(NamedTuple):
 
 
 class Reference:
-    """The truth of a sequence, and where else than over all pixels it is measured.
+    """The truth of a sequence, and the regions that are measured apart from all pixels.
 
     Args:
         sequence: with HR colour, and for regions with an HR G-buffer.
@@ -130,7 +130,7 @@ def measured(
     """A result with every metric, of images that are in memory.
 
     Args:
-        images, truths: display-referred float images [H, W, 3], one pair a frame.
+        images, truths: display-referred float images [H, W, 3], one pair per frame.
         starts: True where a frame does not follow the one before it.
     """
     meter = Meter()

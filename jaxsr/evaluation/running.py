@@ -30,7 +30,7 @@ class Settings(NamedTuple):
     every: int = 1
     """Every n-th frame counts as rendered, the others are extrapolated from their G-buffer."""
     warmup: int = 0
-    """So many frames at the start are made, and not measured."""
+    """Number of frames at the start that are made and not measured."""
     metrics: tuple[str, ...] | None = None
     """Of `jaxsr.metrics.METRICS`; None are all that can be computed here."""
 
@@ -57,7 +57,7 @@ class Evaluation:
     sequence: FrameSequence
     settings: Settings
     reference: Reference
-    """The truth of the sequence, and where else than over all pixels it is measured."""
+    """The truth of the sequence, and the regions that are measured apart."""
     advance: Advance = lambda: None
     """Called twice per frame and method: when the frame is made, and when it is measured."""
     title: str = ""
@@ -65,7 +65,7 @@ class Evaluation:
 
 
 def run_method(evaluation: Evaluation, loaded: LoadedMethod, out: Path) -> MethodResult:
-    """One method over a sequence, its frames written as by `upscale` and measured against the truth.
+    """Run one method over a sequence, write its frames as `upscale` does, and measure them.
 
     Frames of an earlier run of jaxsr in `out` are replaced.
 
@@ -123,7 +123,7 @@ def run_methods(
     compiled: dict[Any, float] | None = None,
     run: RunMethod = run_method,
 ) -> SequenceResult:
-    """Several methods over one sequence, each measured against the truth.
+    """Run several methods over one sequence and measure each against the truth.
 
     Writes `out/<method>/exr|png/`, and `out/truth/png/` and `out/input/png/`.
 

@@ -1,8 +1,8 @@
 """Results as small values: a `SequenceResult` is one sequence and task, a `MethodResult` one method in it.
 
 Images are display-referred, in [0, 1], `[H, W, 3]`, or the path of a PNG that holds them. Metrics are lists
-with one value a frame, named as in `jaxsr.metrics.METRICS`; None where a value is not defined and `inf` for
-the PSNR of identical images. They are over all pixels, and apart from that over the pixels of regions.
+with one value per frame, named as in `jaxsr.metrics.METRICS`; None where a value is not defined and `inf` for
+the PSNR of identical images. They are over all pixels, and again over the pixels of each region.
 """
 
 from collections.abc import Mapping, Sequence
@@ -24,7 +24,7 @@ REGIONS = {
     "edges": "The pixels on both sides of an outline: along a row or column of the HR depth, the inverse of "
     f"the depth is off the straight line of its two neighbours by more than {BEND:.0%} of the largest of the "
     "three. Neither a slanted plane nor a texture, a shadow or a crease is one.",
-    "disocclusions": "What was out of sight in the frame before: holes of "
+    "disocclusions": "What was hidden in the frame before: holes of "
     "jaxsr.ops.masks.disocclusion_mask between the two HR G-buffers. There are none at a cut or a start.",
 }
 """Definitions of the regions that results are measured on (`jaxsr.evaluation.regions`), by name."""
@@ -41,7 +41,7 @@ class MethodResult:
     timing: Timing | None = None
     note: str = ""
     flip_maps: Sequence[bytes] = ()
-    """FLIP error maps for the page as grey JPEG (`flip_jpeg`), one a frame; empty if they are not wanted."""
+    """FLIP error maps of the page as grey JPEG (`flip_jpeg`), one per frame; empty if not wanted."""
     regions: Mapping[str, Mapping[str, Values]] = field(default_factory=dict)
     """The metrics again, over the pixels of a region alone: region -> metric -> values."""
     cost: Cost | None = None

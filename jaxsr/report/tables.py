@@ -120,16 +120,16 @@ def groups(sections: Sequence[SequenceResult]) -> dict[str, list[SequenceResult]
     for section in sections:
         if section.task:
             tasks.setdefault(section.task, []).append(section)
-    return {task: found for task, found in tasks.items() if len(found) > 1}
+    return {task: same for task, same in tasks.items() if len(same) > 1}
 
 
 def mean_scores(task: str, sections: Sequence[SequenceResult], subset: str, region: str = ALL) -> Scores:
     """The mean over sections of the methods that all of them have."""
     single = [scores(section, subset, region) for section in sections]
-    found = [{line.name: line for line in one.lines} for one in single]
+    by_name = [{line.name: line for line in one.lines} for one in single]
     lines = []
-    for name in (n for n in found[0] if all(n in one for one in found)):
-        same = [one[name] for one in found]
+    for name in (n for n in by_name[0] if all(n in one for one in by_name)):
+        same = [one[name] for one in by_name]
         means = {k: summarise([_of(line, k).mean for line in same]) for k in single[0].keys}
         timings = [line.timing for line in same if line.timing]
         costs = [line.cost for line in same if line.cost]
@@ -169,14 +169,14 @@ def number(value: float | None, digits: int) -> str:
     return "∞" if math.isinf(value) else f"{value:.{digits}f}"
 
 
-def cell(found: Summary, key: str, spread: bool = True) -> str:
+def cell(values: Summary, key: str, spread: bool = True) -> str:
     """Mean ± spread, and the identical frames that are not in it (a star if without spread)."""
     digits = METRICS[key].digits
-    text = number(found.mean, digits)
-    if found.spread is not None and found.frames > 1 and spread:
-        text += f" ± {number(found.spread, digits)}"
-    if found.identical and found.frames:
-        text += f" (+{found.identical} identical)" if spread else "*"
+    text = number(values.mean, digits)
+    if values.spread is not None and values.frames > 1 and spread:
+        text += f" ± {number(values.spread, digits)}"
+    if values.identical and values.frames:
+        text += f" (+{values.identical} identical)" if spread else "*"
     return text
 
 
@@ -214,14 +214,14 @@ def rows(
 def _cost_columns(table: Scores, spread: bool) -> dict[str, list[str]]:
     """Title and cells of the columns of time and, if any method has a network, of size."""
     timings, costs = [n.timing for n in table.lines], [n.cost for n in table.lines]
-    found = {}
+    columns = {}
     if any(timings):
-        found["Frame [ms]"] = [_frame_time(t, spread) if t else "–" for t in timings]
-        found["Compile [s]"] = [f"{t.compile_s:.1f}" if t else "–" for t in timings]
+        columns["Frame [ms]"] = [_frame_time(t, spread) if t else "–" for t in timings]
+        columns["Compile [s]"] = [f"{t.compile_s:.1f}" if t else "–" for t in timings]
     if any(c is not None and c.parameters for c in costs):
-        found["Parameters"] = [f"{c.parameters:,}" if c and c.parameters else "–" for c in costs]
-        found["MAC / px"] = [f"{c.multiply_adds_per_px:,.0f}" if c and c.parameters else "–" for c in costs]
-    return found
+        columns["Parameters"] = [f"{c.parameters:,}" if c and c.parameters else "–" for c in costs]
+        columns["MAC / px"] = [f"{c.multiply_adds_per_px:,.0f}" if c and c.parameters else "–" for c in costs]
+    return columns
 
 
 def _frame_time(timing: Timing, spread: bool) -> str:
@@ -236,9 +236,9 @@ def rich_tables(sections: Sequence[SequenceResult], brief: bool = False) -> list
     Args:
         brief: fewer of them, see `all_scores`.
     """
-    found = list(all_scores(sections, brief))
+    all_tables = list(all_scores(sections, brief))
     tables = []
-    for one in found:
+    for one in all_tables:
         columns, cells, marks = rows(one, spread=False, costs=False)
         table = _table(f"{one.title} · {one.about}", columns)
         for line, mark in zip(cells, marks, strict=True):
@@ -246,7 +246,7 @@ def rich_tables(sections: Sequence[SequenceResult], brief: bool = False) -> list
             table.add_row(*(f"[bold green]{escape(c)}[/]" if m else escape(c) for c, m in pairs))
         tables.append(table)
     averaged = {section.title for same in groups(sections).values() for section in same}
-    last = {one.title: one for one in reversed(found) if one.title not in averaged}
+    last = {one.title: one for one in reversed(all_tables) if one.title not in averaged}
     for title, one in reversed(last.items()):
         costs = _cost_columns(one, spread=False)
         if costs:
@@ -369,7 +369,7 @@ def as_json(
 
 
 def as_csv(sections: Sequence[SequenceResult]) -> str:
-    """One line a section, method, frame and region; a metric that is not defined is an empty field."""
+    """One line per section, method, frame and region; a metric that is not defined is an empty field."""
     keys = [k for k in METRICS if any(k in s.metric_keys() for s in sections)]
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")

@@ -94,7 +94,7 @@ def write_video(
         fps: frames per second.
         scale: every pixel is repeated so often in x and y; by default as often as 1920 pixels of width allow.
         per_row: images in a row; by default all.
-        captions: one text a frame, shown beside the first label, for instance "frame 12, extrapolated".
+        captions: one text per frame, shown beside the first label, for instance "frame 12, extrapolated".
         advance: called after each frame, for a progress bar.
 
     Returns:

@@ -62,16 +62,22 @@ def display(color_linear: np.ndarray, exposure: float) -> np.ndarray:
     return np.asarray(to_display(np.ascontiguousarray(color_linear), exposure))
 
 
-def frames_in_memory(sequence: FrameSequence, scale: int, every: int = 1) -> Iterator[Frame]:
+def frames_in_memory(
+    sequence: FrameSequence, scale: int, every: int = 1, needs: frozenset[str] | None = None
+) -> Iterator[Frame]:
     """The frames as a method may see them; no thread runs while the caller works on one.
 
-    Threads decode the next `TOGETHER` frames, and have ended before the first of these is given.
+    Threads decode the next `TOGETHER` frames, and rest before the first of these is given.
+
+    Args:
+        scale, every: as for `upscale`.
+        needs: the buffers to read, see `Sequence.frame`; by default all.
     """
     schedule = rendered_schedule(sequence, every)
     with ThreadPoolExecutor(TOGETHER) as pool:
         for first in range(0, len(schedule), TOGETHER):
             together = range(first, min(first + TOGETHER, len(schedule)))
-            read = [pool.submit(sequence.frame, i, scale, rendered=schedule[i]) for i in together]
+            read = [pool.submit(sequence.frame, i, scale, schedule[i], needs) for i in together]
             wait(read)
             while read:
                 yield read.pop(0).result()  # an error arrives where its frame would have been

@@ -14,6 +14,7 @@ from jaxsr.evaluation.compare import check_match, compare, find_frames, labels
 from jaxsr.io.exr import write_exr
 from jaxsr.io.images import read_png, write_png
 from jaxsr.ops.color import to_display
+from tests.builders import make_sequence
 
 H, W = 20, 24
 
@@ -124,6 +125,17 @@ def test_matching_by_number_by_name_and_with_gaps(folders):
     section = compare([folders / "left"], folders / "right", folders / "out3")
     assert section.frames == (1, 2)
     assert section.methods[0].metrics["psnr"] == [math.inf] * 2
+
+
+def test_frames_have_an_exposure_of_their_own(tmp_path):
+    sequence = make_sequence(tmp_path / "seq", frames=2, size=(32, 24))
+    head = json.loads((sequence.path / "sequence.json").read_text())
+    head["frames"][1]["exposure"] = 0.25
+    (sequence.path / "sequence.json").write_text(json.dumps(head))
+    section = compare([sequence.path / "hr"], sequence.path, tmp_path / "out", keys=("psnr",))
+    for i, exposure in enumerate((1.0, 0.25)):
+        path, linear = section.truths[i], sequence.truth(i)
+        assert np.abs(read_png(path) - np.asarray(to_display(linear, exposure))).max() < 1 / 255
 
 
 @pytest.mark.parametrize(

@@ -1,11 +1,15 @@
 """`upscale` into folders: runs do not mix, nothing of others is touched; frames are in memory when timed."""
 
+import dataclasses
 import json
 import shutil
 
+import numpy as np
 import pytest
 
 from jaxsr.errors import JaxsrError
+from jaxsr.io.images import read_color, read_png
+from jaxsr.ops import to_display
 from jaxsr.runtime.load import find_method
 from jaxsr.runtime.record import SUFFIXES, claim_folder, describe_run, read_run
 from jaxsr.runtime.upscale import TOGETHER, frames_in_memory, upscale
@@ -117,3 +121,13 @@ def test_frames_before_one_that_cannot_be_read_stay(tmp_path):
     with pytest.raises(JaxsrError, match=r"0003.exr"):
         upscale(sequence, find_method("nearest", 2), tmp_path / "out", scale=2)
     assert sorted(p.name for p in (tmp_path / "out" / "exr").iterdir()) == ["0001.exr", "0002.exr"]
+
+
+def test_pictures_have_the_exposure_of_their_frame(tmp_path):
+    sequence = make_sequence(tmp_path / "seq", frames=2, size=(32, 24))
+    sequence.infos[1] = dataclasses.replace(sequence.infos[1], exposure=0.25)
+    upscale(sequence, find_method("nearest", 2), tmp_path / "out", scale=2)
+    for index, exposure in ((1, sequence.exposure), (2, 0.25)):
+        linear = read_color(tmp_path / "out" / "exr" / f"{index:04d}.exr")
+        shown = read_png(tmp_path / "out" / "png" / f"{index:04d}.png")
+        assert abs(np.asarray(to_display(linear, exposure)) - shown).max() < 1 / 255
