@@ -81,7 +81,7 @@ def test_gradients_go_to_the_motion_that_is_read():
 @pytest.mark.parametrize("jitter", [(0.0, 0.0), (0.4, -0.3), (-0.45, 0.45)])
 @pytest.mark.parametrize("scale", [2, 4])
 def test_motion_of_the_analytic_scene_is_right_off_silhouettes(scale, jitter):
-    """Within what motion changes over two LR pixels, and better than with the jitter the wrong way round."""
+    """Within what motion changes over two LR pixels; dilation reads up to one pixel beside the place."""
     size = (192, 128)
     lr = analytic.render(3, (size[0] // scale, size[1] // scale), jitter_px=jitter)
     hr = analytic.render(3, size)
@@ -90,14 +90,14 @@ def test_motion_of_the_analytic_scene_is_right_off_silhouettes(scale, jitter):
     inside = same & np.isfinite(hr["depth"])[..., 0]
     assert inside.sum() > 1000
 
-    def off(stated):
-        depth, motion = hr_from_lr_on_host(lr["depth"], lr["motion"], stated, scale)
-        ratio = depth[inside, 0] / hr["depth"][inside, 0]
-        return np.abs(motion - hr["motion"]).max(-1)[inside], np.abs(ratio - 1)
+    def off(depth, stated):
+        depth, motion = hr_from_lr_on_host(depth, lr["motion"], stated, scale)
+        return np.abs(motion - hr["motion"]).max(-1)[inside], depth
 
-    motion_off, depth_off = off(jitter)
+    motion_off, depth = off(lr["depth"], jitter)
     assert motion_off.max() < 0.25 * scale
     assert motion_off.mean() < 0.05 * np.linalg.norm(hr["motion"], axis=-1)[inside].mean()
-    assert np.median(depth_off) < 0.02 * scale
-    if any(jitter):
-        assert motion_off.mean() < off((-jitter[0], -jitter[1]))[0].mean()
+    assert np.median(np.abs(depth[inside, 0] / hr["depth"][inside, 0] - 1)) < 0.02 * scale
+    if any(jitter):  # where all is equally near, nothing is dilated: the sign of the jitter shows
+        flat = np.ones_like(lr["depth"])
+        assert off(flat, jitter)[0].mean() < 0.7 * off(flat, (-jitter[0], -jitter[1]))[0].mean()
