@@ -13,7 +13,7 @@ from jaxsr.inspection.conventions import CONVENTIONS, UNITS, MotionConvention, i
 from jaxsr.inspection.inspect import inspect, print_report
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.sequence import Sequence
-from tests.builders import frame_info, make_sequence
+from tests.builders import edit_frames, frame_info, make_sequence
 
 SIZE = (160, 96)
 
@@ -455,3 +455,38 @@ def test_jitter_of_one_frame_out_of_range(tmp_path):
     report = inspect(Sequence.open(seq.path, check=False))
     assert report.level == "bad"
     assert "first frame 3: (5, 0)" in report.finding("jitter range").text
+
+
+def test_a_sequence_without_hr_images_is_judged_by_its_lr_images(tmp_path):
+    needs = {"a": frozenset({"lr.color", "hr.depth", "hr.motion"}), "b": frozenset({"hr.normal"})}
+    report = look(tmp_path, needs, hr=False)
+    assert {f.topic: f.level for f in report.findings} == {
+        "files": "ok", "values": "ok", "motion": "ok", "camera and depth": "ok", "normal": "ok",
+    }  # fmt: skip
+    assert report.missing == {"a": [], "b": ["hr.normal"]}
+
+
+def test_wrong_motion_of_lr_images_is_recognised(tmp_path):
+    found = look(tmp_path, hr=False, spoil=change_motion(lambda m, w, h: m * (1, -1))).finding("motion")
+    assert (found.level, found.data["convention"]) == ("bad", "backward, pixels, y up")
+
+
+def test_without_cameras_the_images_alone_are_judged(tmp_path):
+    seq = make_sequence(tmp_path / "seq", frames=2, size=SIZE, scales=())
+    edit_frames(seq.path, lambda frame: frame.pop("camera"))
+    report = inspect(Sequence.open(seq.path))
+    assert report.finding("motion").data["convention"] == "backward, pixels, y down"
+    assert report.finding("camera and depth").text == "cannot tell: the camera is not known"
+    json.dumps(report.to_json(), allow_nan=False)
+
+
+def test_a_camera_that_is_not_rigid_is_found(tmp_path):
+    seq = make_sequence(tmp_path / "seq", frames=2, size=(32, 20), scales=())
+    edit_frames(
+        seq.path, lambda frame: frame["camera"].update(world_from_view=np.diag([2, 2, 2, 1]).tolist())
+    )
+    report = inspect(Sequence.open(seq.path, check=False))
+    found = report.finding("camera matrix")
+    assert (report.level, found.level) == ("bad", "bad")
+    assert "frame 1: world_from_view is not rigid" in found.text
+    assert "(and 1 more)" in found.text
