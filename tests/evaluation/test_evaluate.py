@@ -20,7 +20,7 @@ from jaxsr import metrics
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.code import method_digest
 from jaxsr.evaluation.evaluate import evaluate, find_methods, part
-from jaxsr.evaluation.measuring import Reference
+from jaxsr.evaluation.measuring import Reference, metrics_with
 from jaxsr.evaluation.regions import regions
 from jaxsr.evaluation.running import Evaluation, Settings, run_method
 from jaxsr.io.exr import read_exr, write_exr
@@ -247,11 +247,18 @@ def test_warm_up_is_made_and_not_measured(data, tmp_path):
 
 
 @pytest.mark.skipif("lpips" not in metrics.available(), reason="needs the extra `perceptual`")
-def test_lpips_is_one_of_the_metrics(data, tmp_path):
-    (section,) = run([data / "set" / "one"], ["nearest"], tmp_path / "a", Settings(2), frames=(2, 2))
+def test_lpips_is_one_of_the_metrics(tmp_path):
+    sequence = make_sequence(tmp_path / "seq", frames=1)  # 64x40: AlexNet needs more than 32x24
+    assert metrics_with(lpips=True) == metrics.available()
+    assert metrics_with(lpips=False, lpips_alex=True) == ("psnr", "ssim", "lpips_alex", "flip", "tpsnr")
+    settings = Settings(2, metrics=metrics_with(lpips=True, lpips_alex=True))
+    (section,) = run([sequence.path], ["nearest"], tmp_path / "a", settings)
     assert section.metric_keys() == list(metrics.METRICS)
-    assert section.methods[0].metrics["lpips"][0] > 0
-    assert section.methods[0].regions["edges"]["lpips"][0] > 0
+    for key in ("lpips", "lpips_alex"):
+        assert section.methods[0].metrics[key][0] > 0
+        assert section.methods[0].regions["edges"][key][0] > 0
+    assert "LPIPS-Alex" in (tmp_path / "a" / "report.html").read_text()
+    assert "LPIPS-Alex" in (tmp_path / "a" / "metrics.md").read_text()
 
 
 def test_methods_are_found(data, tmp_path, monkeypatch):
