@@ -142,7 +142,7 @@ def render(
             round_bits=round_bits,
         )
         first, last = described["frames"]
-        # A frame that began a range is a cut: it is made again when the frames before it come to be.
+        # A frame that began a range is a reset: it is made again when the frames before it come to be.
         done = [
             f
             for f in range(first, last + 1)

@@ -26,7 +26,7 @@ NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in ("co
 
 
 class WindowSource:
-    """Item i is a `Window` of `length` consecutive frames; no window crosses a cut.
+    """Item i is a `Window` of `length` consecutive frames; no window crosses a reset.
 
     Buffers that are not needed are None; depth, motion and LR colour, which a `Frame` always has, are then
     zeros that take no memory. All frames are `rendered`. The first frame of a window is a `cut` only if the

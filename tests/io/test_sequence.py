@@ -21,7 +21,7 @@ from jaxsr.io.sequence import FrameInfo, Sequence, SequenceWriter, prefetch
 from jaxsr.io.writing import round_mantissa
 from jaxsr.layers import LAYERS, channels
 from jaxsr.ops.motion import hr_from_lr_on_host
-from tests.builders import frame_info, halton_jitter, make_sequence
+from tests.builders import frame_info, halton_jitter, make_sequence, random_weights
 
 SIZE = (32, 24)
 
@@ -689,7 +689,9 @@ def test_the_writer_is_told_of_sequences_without_hr_images(tmp_path):
         writer(tmp_path / "b").write_frame(frame_info(1, SIZE), None, {2: layers(1, 2)})
 
 
-@pytest.mark.parametrize("method", ["bilinear", "bicubic", "taau"])
+@pytest.mark.parametrize("method", ["bilinear", "bicubic", "taau", "rcan", "rrn", "nsrr"])
 def test_methods_upscale_what_has_no_hr_images(lr_only, tmp_path, method):
+    if method in ("rcan", "rrn", "nsrr"):
+        method = str(random_weights(tmp_path / f"{method}.safetensors", scale=2, method=method))
     main(["upscale", str(lr_only.path), "--method", method, "--out", str(tmp_path / "out")])
     assert len(list((tmp_path / "out/png").glob("*.png"))) == 3
