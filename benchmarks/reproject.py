@@ -6,7 +6,8 @@ Ours against a plain numba loop over pixels (all cores, fast-math), against the 
 (per-pixel gather, top_k, softmax), and against PyTorch eager (gather of all candidates, topk).
 Questions: the forward pass, forward with the gradient of the previous image, forward with all gradients.
 With `--forms` only the forms of ours are compared, on the default device, a CPU or a GPU. A condition, an
-optimisation barrier or nothing keeps XLA from making copies, and a batch is mapped or vmapped.
+optimisation barrier or nothing keeps XLA from making copies, and a batch is mapped or vmapped. README.md has
+the times of a GPU.
 
 Tried for ours (CPU time over numba's, selection alone): winners as four outputs or whole-image keys 1.5-1.8;
 one packed output, planar guides 0.55; the same without signed indices 0.5; whole pixels of guides and where()

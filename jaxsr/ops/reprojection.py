@@ -99,7 +99,7 @@ def reproject(
         candidate_offsets(strides, radius),
         count,
         batching="map" if jax.default_backend() == "cpu" and jax.device_count() == 1 else "vmap",
-        fence="cond" if jax.default_backend() == "cpu" else "none",
+        fence="cond",
     )
 
 
@@ -119,9 +119,9 @@ def _reproject(
         sigmas: of the guide, of the distance.
         offsets: of the candidates.
         count: how many candidates are kept.
-        batching: "map" takes one image after the other, which on a CPU needs a tenth of the memory and half
-            the time. On several devices it would gather a batch that is sharded over them; "vmap" keeps the
-            sharding.
+        batching: "map" takes one image after the other. On a CPU this needs a tenth of the memory and half
+            the time of "vmap"; on a GPU it is several times slower. On several devices it would gather a
+            batch that is sharded over them; "vmap" keeps the sharding.
         fence: see `_fenced`.
     """
     dtype = functools.reduce(np.promote_types, (a.dtype for a in arrays[1:]), np.dtype(np.float32))
@@ -148,9 +148,10 @@ def _reproject(
 def _fenced(compute: Callable[[], T], fence: Fence) -> T:
     """The result of `compute`, which XLA must not copy into each of its readers.
 
-    On a CPU such copies take five times as long. A conditional boundary stops XLA from making them: "cond" is
-    a condition on an opaque True, a constant that XLA cannot see through. "barrier" is an optimisation
-    barrier. "none" trusts the compiler: on a GPU a condition may cost a round trip to the host.
+    "cond" puts `compute` behind a condition on an opaque True, a constant that XLA cannot see through. The
+    conditional boundary stops XLA from making copies. "barrier" is an optimisation barrier, "none" trusts the
+    compiler. With copies everything takes five times as long on a CPU, and twice as long on a GPU, where the
+    barrier does not help (benchmarks/README.md).
     """
     if fence == "none":
         return compute()

@@ -66,11 +66,13 @@ def examples(dtype: Any = np.float32) -> dict[str, Example]:
         ),
         "demodulation_divisor": Example(lambda b, f: ops.demodulation_divisor(b, surface=f), (base, surface)),
         "depth_mask": Example(ops.depth_mask, (depth, depth, motion), ()),
+        "dilate_motion": Example(ops.dilate_motion, (depth, motion), both),
         "disocclusion_mask": Example(
             ops.disocclusion_mask, (gbuffer, gbuffer, camera, camera_before, jitter, before), ()
         ),
         "forward_splat": Example(ops.forward_splat, (color, motion, depth)),
         "from_display": Example(ops.from_display, (color,)),
+        "hr_from_lr": Example(functools.partial(ops.hr_from_lr, scale=2), (depth, motion, jitter), both),
         "inverse_tone_map": Example(ops.inverse_tone_map, (color,)),
         "jittered_motion": Example(ops.jittered_motion, (motion, jitter, before), (0, 1, 2)),
         "linear_from_srgb": Example(ops.linear_from_srgb, (color,)),
