@@ -39,6 +39,7 @@ from jaxsr.files import atomic_path
 from jaxsr.frames import Frame
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.methods import METHODS, Method, guided, guided_taau, taau
+from jaxsr.methods.base import step as step_of
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
 from jaxsr.runtime.schedule import observed
 
@@ -132,7 +133,7 @@ Clip = tuple[list[Frame], jax.Array, float]
 
 def score(method: Method, clips: Sequence[Clip]) -> float:
     """Mean PSNR of super-resolution over all frames but the first two of each clip."""
-    step = jax.jit(method.step)
+    step = jax.jit(step_of(method))
     values = []
     for frames, truths, exposure in clips:
         state = method.init(frames[0])

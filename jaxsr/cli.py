@@ -70,7 +70,8 @@ def inspect(
     from jaxsr.methods import METHODS
 
     report = inspect_sequence(
-        Sequence.open(sequence, check=False), {name: method.needs for name, method in METHODS.items()}
+        Sequence.open(sequence, check=False),
+        {name: method.needs.rendered for name, method in METHODS.items()},
     )
     if json:
         print(json_module.dumps(report.to_json(), indent=1))
@@ -293,8 +294,8 @@ def convert_weights(
     from jaxsr.weights.convert import convert_published
 
     header = convert_published(source, out, method, scale=scale, buffers=buffers or None, half=half)
-    told = ", ".join(f"{name} {value}" for name, value in header["arguments"].items())
-    print(f"{out}: {header['method']}, {told}")
+    settings = ", ".join(f"{k} {v}" for k, v in header["settings"].items() if not isinstance(v, dict))
+    print(f"{out}: {header['method']}, {settings}")
 
 
 @app.command(name="train")

@@ -12,8 +12,8 @@ from jaxsr.data import analytic
 from jaxsr.io.sequence import Sequence
 from jaxsr.io.writing import FrameInfo, SequenceWriter
 from jaxsr.layers import LAYERS
-from jaxsr.methods import build
-from jaxsr.weights.file import save_weights
+from jaxsr.methods import variant
+from jaxsr.weights.file import new_header, save_weights
 from tests.networks import SMALL
 
 Layers = dict[str, np.ndarray]
@@ -87,11 +87,11 @@ def edit_frames(path: Path, change: Callable[[dict[str, Any]], object]) -> None:
 
 def random_weights(path: Path, *, scale: int, method: str = "fusion-sr", seed: int = 0) -> Path:
     """A file of weights as training writes it, but of a network that has learned nothing."""
-    made = build(method, SMALL[method] | {"scale": scale} if method in SMALL else {})
-    assert made.new_net is not None
-    new_net, rng = made.new_net, np.random.default_rng(seed)
-    # Not what `new_net` begins with: that may be made to change nothing, and takes long to make.
-    state = nnx.state(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))), nnx.Not(nnx.RngState))
+    network = variant(method, SMALL[method] | {"scale": scale} if method in SMALL else {}).network
+    assert network is not None
+    rng = np.random.default_rng(seed)
+    # Not what `network.new` begins with: that may be made to change nothing, and takes long to make.
+    state = nnx.state(nnx.eval_shape(lambda: network.new(nnx.Rngs(0))), nnx.Not(nnx.RngState))
     arrays = {}
     for place, variable in nnx.to_flat_state(state):
         shape = variable.get_value().shape
@@ -99,5 +99,5 @@ def random_weights(path: Path, *, scale: int, method: str = "fusion-sr", seed: i
             arrays[".".join(map(str, place))] = rng.normal(size=shape) / np.sqrt(np.prod(shape[:-1]))
         else:
             arrays[".".join(map(str, place))] = np.full(shape, float(place[-1] in ("scale", "var")))
-    save_weights(path, arrays, {"method": method, "arguments": dict(made.arguments), "scale": scale})
+    save_weights(path, arrays, new_header(method, network.settings, scale))
     return path

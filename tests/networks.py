@@ -9,7 +9,7 @@ from flax import nnx
 
 SMALL: dict[str, dict[str, int]] = {
     "rcan": {"groups": 1, "blocks": 2, "features": 8, "reduction": 4},
-    "rrn": {"blocks": 1, "features": 8, "frames": 3},
+    "rrn": {"blocks": 1, "features": 8},
 }
 """Options of methods whose networks are large by default."""
 

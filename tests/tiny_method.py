@@ -16,7 +16,8 @@ import jax
 import jax.numpy as jnp
 from flax import nnx
 
-from jaxsr.methods import Method
+from jaxsr.methods import Method, Needs, Network, Windows
+from jaxsr.methods.base import module_maker
 from jaxsr.ops import from_display, to_display, upsample
 
 
@@ -40,16 +41,18 @@ def loss(net, window):
     return error, {"l1": error}
 
 
-def step(net, state, frame):
-    module = nnx.merge(nnx.graphdef(nnx.eval_shape(lambda: Net(nnx.Rngs(0)))), net)
-    module.eval()
-    made = module(to_display(frame.color_linear)[None], frame.hr.base_color[None])[0]
+module = module_maker(Net)
+
+
+def upscale(net, state, frame):
+    made = module(net)(to_display(frame.color_linear)[None], frame.hr.base_color[None])[0]
     return state, from_display(jnp.clip(made, 0, 1))
 
 
 def method(loss=loss, window: int = 1) -> Method:
-    needs = frozenset({"lr.color", "hr.base_color"})
-    return Method("tiny", "for tests", lambda frame: (), step, needs, Net, loss, window)
+    needs = Needs(frozenset({"lr.color", "hr.base_color"}))
+    network = Network(Net, loss, Windows(window))
+    return Method("tiny", "for tests", needs, lambda frame: (), upscale, upscale, network)
 
 
 def train(data: Path, out: Path, **options):

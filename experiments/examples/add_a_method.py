@@ -11,7 +11,9 @@ from flax import nnx
 from jaxsr.data.sample import unpack_sample
 from jaxsr.evaluation.evaluate import evaluate
 from jaxsr.evaluation.running import Settings
-from jaxsr.methods import LEARNED, Learned, Method
+from jaxsr.methods import LEARNED, Learned, Method, Needs, Network
+from jaxsr.methods.base import module_maker
+from jaxsr.methods.history import no_image
 from jaxsr.ops import from_display, sample_jittered, to_display
 from jaxsr.progress import Bars
 from jaxsr.training import TrainConfig, train
@@ -34,15 +36,22 @@ def loss(net, window):  # of a batch of windows; here their last frames are all 
     return jnp.mean(jnp.abs(jax.vmap(net)(frames) - jax.vmap(to_display)(truth, frames.exposure))), {}
 
 
-def step(net, state, frame):  # one frame; `state` is what goes from frame to frame
-    module = nnx.merge(nnx.graphdef(nnx.eval_shape(lambda: Net(nnx.Rngs(0)))), net)
-    image = from_display(jnp.clip(module(frame), 0, 1)) / frame.exposure
-    return (jnp.where(frame.rendered, image, state),) * 2  # where nothing was rendered, the last again
+module = module_maker(Net)
 
 
-NEEDS = frozenset({"lr.color", "hr.base_color", "hr.normal"})
-MINE = Method("mine", "a network", lambda f: jnp.zeros_like(f.hr.normal), step, NEEDS, Net, loss)
-LEARNED["mine"] = Learned(make_dataclass("Options", []), lambda _: MINE)  # how its weights find it
+def upscale(net, state, frame):  # a rendered frame; `state` goes from frame to frame
+    image = from_display(jnp.clip(module(net)(frame), 0, 1)) / frame.exposure
+    return image, image
+
+
+def extrapolate(net, state, frame):  # a frame that was not rendered: the last one again
+    return state, state
+
+
+NEEDS = Needs(frozenset({"lr.color", "hr.base_color", "hr.normal"}))
+MINE = Method("mine", "a network", NEEDS, no_image, upscale, extrapolate, Network(Net, loss))
+NONE = make_dataclass("Options", [])
+LEARNED["mine"] = Learned(NONE, NONE, lambda *_: MINE)  # how its weights find it
 
 
 def main(steps: int = 150, out: Path = Path("example")) -> None:

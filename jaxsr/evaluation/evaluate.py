@@ -80,7 +80,7 @@ def _check(sequence: FrameSequence, methods: Sequence[LoadedMethod], settings: S
             )
     settings.check(sequence)
     for loaded in methods:
-        check_needs(loaded.method, sequence, settings.scale)
+        check_needs(loaded.method, sequence, settings.scale, settings.every)
 
 
 def evaluate(

@@ -73,7 +73,7 @@ def run_method(evaluation: Evaluation, loaded: LoadedMethod, out: Path) -> Metho
         JaxsrError: as for `upscale`, and an output that is not of the size of the truth.
     """
     sequence, settings, advance = evaluation.sequence, evaluation.settings, evaluation.advance
-    check_needs(loaded.method, sequence, settings.scale)
+    check_needs(loaded.method, sequence, settings.scale, settings.every)
     name = loaded.method.name
     run = describe_run(sequence, settings.scale, settings.every, name, loaded.weights)
     claim_folder(out, run, replace=True)

@@ -1,61 +1,78 @@
-"""One file a method: which buffers it needs, its step over a sequence, and its loss if it learns."""
+"""One file per method: which buffers it needs, its two steps, and its loss if it learns."""
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxsr.errors import JaxsrError
 from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, nsrr, rcan, rrn, taau
-from jaxsr.methods.base import Method
+from jaxsr.methods.base import Method, Needs, Network, Windows
+from jaxsr.methods.image_loss import ImageLoss, L1Loss
+from jaxsr.methods.options import from_json, to_json
 
 
 class Learned(NamedTuple):
-    """How a method with a network is made: its options, and the method of them."""
+    """How a method with a network is made: from its settings and the weights of its loss."""
 
     options: type
-    method: Callable[[Any], Method]
+    """A frozen dataclass; a file of weights records its fields."""
+    loss: type
+    """A frozen dataclass; a training records its fields."""
+    method: Callable[[Any, Any], Method]
+    """`method(options, loss)`."""
 
 
 LEARNED: dict[str, Learned] = {
-    "fusion-sr": Learned(fusion_sr.Options, fusion_sr.method),
-    "rcan": Learned(rcan.Options, rcan.method),
-    "rrn": Learned(rrn.Options, rrn.method),
-    "nsrr": Learned(nsrr.Options, nsrr.method),
+    "fusion-sr": Learned(fusion_sr.Options, ImageLoss, fusion_sr.method),
+    "rcan": Learned(rcan.Options, L1Loss, rcan.method),
+    "rrn": Learned(rrn.Options, rrn.Loss, rrn.method),
+    "nsrr": Learned(nsrr.Options, ImageLoss, nsrr.method),
 }
 
 METHODS: dict[str, Method] = {
-    made.name: made
-    for made in (
+    method.name: method
+    for method in (
         interpolation.method("nearest"),
         interpolation.method("bilinear"),
         interpolation.method("bicubic"),
         taau.method(),
         guided.method(),
         guided_taau.method(),
-        *(learned.method(learned.options()) for learned in LEARNED.values()),
+        *(learned.method(learned.options(), learned.loss()) for learned in LEARNED.values()),
     )
 }
 
 
-def build(name: str, arguments: Mapping[str, Any]) -> Method:
-    """The learned method of that name with the arguments that a file of weights records.
+def build(name: str, settings: Mapping[str, Any], where: object = None) -> Method:
+    """The method with a network of that name, with the settings that a file of weights records.
+
+    Args:
+        name: one of `LEARNED`.
+        settings: all of them, as `Network.settings` gives them.
+        where: what an error names, such as the file.
 
     Raises:
-        JaxsrError: no such method, or it has no such argument.
+        JaxsrError: there is no such method, or a setting is missing, unknown or wrong.
     """
     if name not in LEARNED:
-        raise JaxsrError(f"no method {name!r} that learns", expected="one of " + ", ".join(LEARNED))
-    learned = LEARNED[name]
-    known = {field.name for field in dataclasses.fields(learned.options)}
-    if unknown := sorted(set(arguments) - known):
         raise JaxsrError(
-            f"method {name!r} has no argument {unknown[0]!r}",
-            expected=", ".join(sorted(known)),
-            fix="update jaxsr, or train again",
+            f"no method {name!r} that learns", where=where, expected="one of " + ", ".join(LEARNED)
         )
-    # JSON knows no tuples.
-    values = {k: tuple(v) if isinstance(v, list) else v for k, v in arguments.items()}
-    return learned.method(learned.options(**values))
+    learned = LEARNED[name]
+    return learned.method(from_json(learned.options, settings, where), learned.loss())
 
 
-__all__ = ["LEARNED", "METHODS", "Learned", "Method", "build"]
+def variant(name: str, changes: Mapping[str, Any]) -> Method:
+    """The method with a network of that name, with some settings other than their defaults.
+
+    Args:
+        name: one of `LEARNED`.
+        changes: as JSON values.
+
+    Raises:
+        JaxsrError: there is no such method, or a setting is unknown or wrong.
+    """
+    defaults = to_json(LEARNED[name].options()) if name in LEARNED else {}
+    return build(name, defaults | dict(changes))
+
+
+__all__ = ["LEARNED", "METHODS", "Learned", "Method", "Needs", "Network", "Windows", "build", "variant"]

@@ -1,5 +1,6 @@
-"""What a method is: a pure step over a sequence, and what it needs to take that step."""
+"""What a method is: two pure steps, the buffers that they need, and the network behind them if it has one."""
 
+import functools
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple
@@ -12,49 +13,129 @@ from jaxtyping import Array, Float
 from jaxsr.frames import Frame, Window
 
 State = Any
-"""A pytree of arrays; constant in size whatever the length of the clip."""
+"""A pytree of arrays; its size does not depend on the length of the clip."""
 Net = Any
 """A pytree of parameters (an `nnx.State`); None for methods that learn nothing."""
 Step = Callable[[Net, State, Frame], tuple[State, Float[Array, "H W 3"]]]
 Loss = Callable[[nnx.Module, Window], tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
 
 
-class Method(NamedTuple):
-    """A name, two pure functions and a list of needs.
+class Needs(NamedTuple):
+    """Buffers that a method reads, by place and layer, such as "lr.color" or "hr.normal"."""
 
-    `step(net, state, frame) -> state, image` makes the HR linear colour of one frame; it serves streaming,
-    `jax.lax.scan`, evaluation and export alike. It never sees the truth. Where `frame.reset` is set it
-    ignores the state; where `frame.rendered` is not, it extrapolates and ignores `frame.color_linear`.
-    Nothing can be made of a frame that is both a reset and not rendered: whoever schedules the frames renders
-    the first one of a shot.
+    rendered: frozenset[str]
+    """Of a rendered frame."""
+    extrapolated: frozenset[str] = frozenset()
+    """Of a frame that is to be extrapolated, and of the rendered frames before it."""
+
+    def of(self, rendered: bool, extrapolating: bool = True) -> frozenset[str]:
+        """What one frame must have.
+
+        Args:
+            rendered: whether this frame was rendered.
+            extrapolating: whether any frame of the clip is to be extrapolated.
+        """
+        if not rendered:
+            return self.extrapolated
+        return self.rendered | self.extrapolated if extrapolating else self.rendered
+
+
+class Windows(NamedTuple):
+    """The windows of consecutive frames that a network trains on."""
+
+    length: int = 1
+    """Frames per window."""
+    rendered: tuple[bool, ...] | None = None
+    """Which of them count as rendered; None means all. The colour of the others is hidden (zero)."""
+    made: tuple[int, ...] | None = (-1,)
+    """Positions of the frames that the loss compares with the truth; None means all."""
+    warmup: int = 0
+    """Frames at the start that only fill the history; evaluation does not measure them."""
+    multiple: int = 1
+    """LR sides of crops are multiples of this."""
+    lr_truth: bool = False
+    """Whether the loss wants the LR colour of the frames that are to be made."""
+
+    @property
+    def cadence(self) -> tuple[bool, ...]:
+        """`rendered`, written out."""
+        return (True,) * self.length if self.rendered is None else self.rendered
+
+    @property
+    def targets(self) -> tuple[int, ...]:
+        """`made` as positions from 0, in the order of time."""
+        made = range(self.length) if self.made is None else self.made
+        return tuple(sorted(i % self.length for i in made))
+
+
+class Network(NamedTuple):
+    """The part of a method that learns."""
+
+    new: Callable[[nnx.Rngs], nnx.Module]
+    """A fresh module, which may hold several networks. Its `nnx.state` is what the steps take as `net`."""
+    loss: Loss
+    """`loss(module, window) -> total, parts` of a batch of windows, with the module in training mode."""
+    windows: Windows = Windows()
+    settings: Mapping[str, Any] = MappingProxyType({})
+    """All that the output depends on besides the parameters, as JSON values: `methods.build(name, settings)`
+    makes the method again. A file of weights records them."""
+    loss_settings: Mapping[str, Any] = MappingProxyType({})
+    """Weights and other settings of the loss, as JSON values: a training records them."""
+    frozen: Any = False
+    """An NNX filter of the parameters that training leaves as they are: `nnx.PathContains("frnet")`."""
+
+
+class Method(NamedTuple):
+    """A method: two pure step functions, the buffers that they need, and its network if it has one.
+
+    Both steps are `(net, state, frame) -> state, image`: the image is the HR linear colour of one frame.
+    `upscale` makes a rendered frame, `extrapolate` one that has only its G-buffers and ignores
+    `frame.color_linear`. Streaming, `jax.lax.scan`, evaluation and export all run these same functions. They
+    never see the truth. Whoever runs them drops the state at a reset, by calling `init` again; `step` does.
     """
 
     name: str
     summary: str
+    needs: Needs
     init: Callable[[Frame], State]
     """The empty state for frames of this shape."""
-    step: Step
-    needs: frozenset[str]
-    """Buffers by size and name, for instance "lr.color" or "hr.normal"."""
-    new_net: Callable[[nnx.Rngs], nnx.Module] | None = None
-    """A fresh network, whose `nnx.state` is what `step` takes as `net`; None where nothing is learned."""
-    loss: Loss | None = None
-    """`loss(net, window) -> total, parts` on a batch of windows, in the net's training mode."""
-    window: int = 1
-    """Consecutive frames that `loss` wants in a window."""
-    arguments: Mapping[str, Any] = MappingProxyType({})
-    """What a file of weights must record to build this method again: `methods.build(name, arguments)`."""
+    upscale: Step
+    extrapolate: Step
+    network: Network | None = None
+    """None where nothing is learned."""
 
 
-def by_rendered(
-    init: Callable[[Frame], State],
-    upscale: Callable[[Net, State, Frame], tuple[State, Array]],
-    extrapolate: Callable[[Net, State, Frame], tuple[State, Array]],
-) -> Step:
-    """A step that upscales rendered frames, extrapolates the others, and starts anew at a cut."""
+def step(method: Method) -> Step:
+    """Both steps as one, for `jax.lax.scan`: it looks at `frame.rendered`, and starts anew at a reset.
+
+    Nothing can be made of a frame that is both a reset and not rendered: whoever schedules the frames renders
+    the first one of a shot.
+    """
 
     def step(net: Net, state: State, frame: Frame) -> tuple[State, Array]:
-        state = jax.tree.map(lambda new, old: jnp.where(frame.reset, new, old), init(frame), state)
-        return jax.lax.cond(frame.rendered, upscale, extrapolate, net, state, frame)
+        state = jax.tree.map(lambda new, old: jnp.where(frame.reset, new, old), method.init(frame), state)
+        return jax.lax.cond(frame.rendered, method.upscale, method.extrapolate, net, state, frame)
 
     return step
+
+
+def module_maker(new: Callable[[nnx.Rngs], nnx.Module]) -> Callable[[Net], Any]:
+    """`make(net)`: the module with these parameters, in evaluation mode. Its graph is built only once."""
+
+    @functools.cache
+    def graph() -> Any:
+        module = nnx.eval_shape(lambda: new(nnx.Rngs(0)))
+        module.eval()
+        return nnx.graphdef(module)
+
+    return lambda net: nnx.merge(graph(), net)
+
+
+def last_frames(window: Window) -> tuple[Frame, Float[Array, "b H W 3"]]:
+    """The last frame of each window of a batch, and its truth: for networks that see one frame."""
+    return jax.tree.map(lambda x: x[:, -1], window.frames), window.truth_linear[:, -1]
+
+
+def one_image(tree: Any) -> Any:
+    """A pytree of arrays as a batch of one."""
+    return jax.tree.map(lambda x: jnp.asarray(x)[None], tree)

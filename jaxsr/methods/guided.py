@@ -12,39 +12,53 @@ The output is also the next history, worth less where the match was poor.
 """
 
 from dataclasses import asdict, dataclass
-from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsr.frames import Frame, GBuffer
+from jaxsr.errors import JaxsrError
+from jaxsr.frames import Frame, GBuffer, surface
 from jaxsr.methods import taau
-from jaxsr.methods.base import Method, by_rendered
+from jaxsr.methods.base import Method, Needs, Net
+from jaxsr.methods.history import Extrapolation, History, no_image
+from jaxsr.methods.options import check_options
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject
 from jaxsr.ops.reprojection import DEFAULT_SIGMA_GUIDE, DEFAULT_SIGMA_SPACE
+
+BUFFERS = frozenset({"hr.depth", "hr.motion", "hr.base_color", "hr.normal"})
+"""What guided reprojection reads of both frames; depth says what is sky."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """Constants of the reprojection; sigmas are measured by `experiments/tune_classical.py`."""
+    """Constants of the reprojection; `experiments/tune_classical.py` measures the sigmas."""
 
     sigma_guide: float = DEFAULT_SIGMA_GUIDE
+    """Standard deviation of differences of base colour and normal."""
     sigma_space: float = DEFAULT_SIGMA_SPACE
+    """Standard deviation of the distance to the end of the motion, in pixels."""
     strides: tuple[int, ...] = (1, 3, 5, 9)
+    """Spacings of the candidates, in pixels."""
     radius: int = 1
+    """Candidates per direction and stride."""
     count: int = 4
+    """Candidates that are kept."""
+    eps: float = 0.02
+    """Smallest base colour that the colour of a surface is divided by."""
+
+    def check(self) -> None:
+        """Raise JaxsrError for an option out of range."""
+        check_options(self)
+        for name in ("sigma_guide", "sigma_space", "count", "eps"):
+            if not getattr(self, name) > 0:
+                raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=0)
+        if not self.strides or min(self.strides) < 1:
+            raise JaxsrError("bad strides", where="strides", expected="spacings from 1", found=self.strides)
 
 
-class State(NamedTuple):
-    """The history of TAAU, and the HR buffers that its image was made with."""
-
-    history: taau.State
-    base_color: Float[Array, "H W 3"]
-    normal: Float[Array, "H W 3"]
-
-
-def surface(gbuffer: GBuffer) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 3"]]:
-    """Base colour and normal; `needs` promised that they are there."""
+def surface_of(gbuffer: GBuffer) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 3"]]:
+    """Base colour and normal; the needs of the method promise that they are there."""
     assert gbuffer.base_color is not None
     assert gbuffer.normal is not None
     return gbuffer.base_color, gbuffer.normal
@@ -52,43 +66,89 @@ def surface(gbuffer: GBuffer) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 
 
 def guide(gbuffer: GBuffer) -> Float[Array, "H W 6"]:
     """g: base colour and normal."""
-    return jnp.concatenate(surface(gbuffer), -1)
+    return jnp.concatenate(surface_of(gbuffer), -1)
 
 
-def init(frame: Frame) -> State:
-    """An empty history."""
-    return State(taau.init(frame), *map(jnp.zeros_like, surface(frame.hr)))
+def lighting_of(color_linear: Float[Array, "H W 3"], gbuffer: GBuffer, eps: float) -> Float[Array, "H W 3"]:
+    """Colour over base colour; sky keeps its colour."""
+    base_color = surface_of(gbuffer)[0]
+    return demodulate(color_linear, base_color, surface=surface(gbuffer.depth_linear), eps=eps)
 
 
-def extrapolate(options: Options, state: State, frame: Frame) -> tuple[State, Array]:
-    """A frame from its G-buffer and the history alone."""
-    previous = GBuffer(state.history.depth_linear, frame.hr.motion_px, state.normal, state.base_color)
+def color_of(lighting: Float[Array, "H W 3"], gbuffer: GBuffer, eps: float) -> Float[Array, "H W 3"]:
+    """The inverse of `lighting_of`."""
+    return modulate(lighting, surface_of(gbuffer)[0], surface=surface(gbuffer.depth_linear), eps=eps)
+
+
+def keep(image: Float[Array, "H W 3"], frame: Frame) -> History:
+    """The history after an output: the image and its HR surface, where the frame has one."""
+    return History(image, frame.hr.depth_linear, frame.hr.base_color, frame.hr.normal)
+
+
+def reprojected(
+    last: History, frame: Frame, options: Options
+) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 1"]]:
+    """The frame from its G-buffer and the last output alone, and how good the matches were (0 to 1)."""
+    settings = asdict(options)
+    eps = settings.pop("eps")
     lighting, confidence = reproject(
-        demodulate(state.history.image, state.base_color, surface=jnp.isfinite(previous.depth_linear)),
+        lighting_of(last.image, last.gbuffer, eps),
         frame.hr.motion_px,
         guide(frame.hr),
-        guide(previous),
-        **asdict(options),
+        guide(last.gbuffer),
+        **settings,
     )
-    image = modulate(lighting, surface(frame.hr)[0], surface=jnp.isfinite(frame.hr.depth_linear))
-    weight = backward_warp(state.history.weight, frame.hr.motion_px) * confidence
-    history = taau.State(image, weight, frame.hr.depth_linear)
-    return State(history, *surface(frame.hr)), image
+    return color_of(lighting, frame.hr, eps), confidence
+
+
+def reprojection(options: Options) -> Extrapolation:
+    """Frames that were not rendered by guided reprojection of the last output, for any method."""
+
+    def extrapolate(net: Net, last: History, frame: Frame) -> tuple[History, Array]:
+        image, _ = reprojected(last, frame, options)
+        return keep(image, frame), image
+
+    return Extrapolation(BUFFERS, no_history, keep, extrapolate)
+
+
+def no_history(frame: Frame) -> History:
+    """The history before the first output."""
+    return jax.tree.map(jnp.zeros_like, keep(no_image(frame), frame))
+
+
+def init(frame: Frame) -> taau.State:
+    """An empty history with a surface."""
+    last = no_history(frame)
+    assert last.depth_linear is not None
+    return taau.State(last, last.depth_linear)
+
+
+def extrapolate(options: Options, state: taau.State, frame: Frame) -> tuple[taau.State, Array]:
+    """`reprojected` as the step of a method that has a weighted history: poor matches are worth less."""
+    image, confidence = reprojected(state.last, frame, options)
+    weight = backward_warp(state.weight, frame.hr.motion_px) * confidence
+    return taau.State(keep(image, frame), weight), image
 
 
 def method(options: Options | None = None, taau_options: taau.Options | None = None) -> Method:
-    """Guided reprojection on top of TAAU."""
+    """Guided reprojection on top of TAAU.
+
+    Raises:
+        JaxsrError: an option out of range.
+    """
     o = options or Options()
+    o.check()
     upscaler = taau.method(taau_options)
 
-    def upscale(net: None, state: State, frame: Frame) -> tuple[State, Array]:
-        history, image = upscaler.step(net, state.history, frame)
-        return State(history, *surface(frame.hr)), image
+    def upscale(net: None, state: taau.State, frame: Frame) -> tuple[taau.State, Array]:
+        state, image = upscaler.upscale(net, state, frame)
+        return taau.State(keep(image, frame), state.weight), image
 
     return Method(
         "guided",
         "TAAU; G-buffer-guided reprojection of the lighting where nothing was rendered",
+        Needs(upscaler.needs.rendered, BUFFERS),
         init,
-        by_rendered(init, upscale, lambda net, state, frame: extrapolate(o, state, frame)),
-        upscaler.needs | {"hr.base_color", "hr.normal"},
+        upscale,
+        lambda net, state, frame: extrapolate(o, state, frame),
     )

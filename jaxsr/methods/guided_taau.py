@@ -17,10 +17,16 @@ from dataclasses import dataclass
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, GBuffer
 from jaxsr.methods import guided, taau
-from jaxsr.methods.base import Method, by_rendered
-from jaxsr.ops import demodulate, modulate
+from jaxsr.methods.base import Method, Needs
+from jaxsr.methods.options import check_options
+
+BUFFERS = frozenset(
+    f"{place}.{layer}" for place in ("lr", "hr") for layer in ("depth", "base_color", "normal")
+)
+"""What the weights of the samples compare."""
 
 
 @dataclass(frozen=True)
@@ -29,20 +35,34 @@ class Options:
 
     sigma_guide: float = 0.3
     """Standard deviation of the difference of base colour and normal between an HR pixel and an LR sample."""
+    depth_tolerance: float = 0.05
+    """Relative difference of 1 / depth between an HR pixel and an LR sample of the same surface."""
+    eps: float = 0.02
+    """Smallest base colour that the colour of a surface is divided by."""
     temporal: taau.Options = taau.Options(  # noqa: RUF009 (frozen)
         kernel_sigma=0.5, sample_sigma=0.7, memory=2.0, box=1.0
     )
+    """The accumulation over time."""
+
+    def check(self) -> None:
+        """Raise JaxsrError for an option out of range."""
+        check_options(self)
+        self.temporal.check()
+        for name in ("sigma_guide", "depth_tolerance", "eps"):
+            if not getattr(self, name) > 0:
+                raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=0)
 
 
-def same_surface(gbuffer: GBuffer, sigma_guide: float) -> taau.Alike:
-    """How alike the surface of an HR pixel and a sample's are, from base colour, normal and 1 / depth."""
+def same_surface(gbuffer: GBuffer, options: Options) -> taau.Alike:
+    """How alike the surfaces of an HR pixel and of a sample are, from base colour, normal and 1 / depth."""
     inverse = 1 / gbuffer.depth_linear
-    tolerance = 0.05 * inverse + 2 * taau.slope(inverse) + 1e-6
-    scale = jnp.concatenate([jnp.full_like(guided.guide(gbuffer), 1 / sigma_guide), 1 / tolerance], -1)
-    own = jnp.concatenate([guided.guide(gbuffer), inverse], -1)
+    tolerance = options.depth_tolerance * inverse + 2 * taau.slope(inverse) + 1e-6
+    features = guided.guide(gbuffer)
+    scale = jnp.concatenate([jnp.full_like(features, 1 / options.sigma_guide), 1 / tolerance], -1)
+    own = jnp.concatenate([features, inverse], -1)
 
-    def alike(features: Float[Array, "H W 7"]) -> Float[Array, "H W 1"]:
-        squares = ((features - own) * scale) ** 2
+    def alike(sample: Float[Array, "H W 7"]) -> Float[Array, "H W 1"]:
+        squares = ((sample - own) * scale) ** 2
         # Written out: a reduction over so few channels is slow on CPUs.
         total = squares[..., :1]
         for i in range(1, squares.shape[-1]):
@@ -55,44 +75,45 @@ def same_surface(gbuffer: GBuffer, sigma_guide: float) -> taau.Alike:
 def estimate(frame: Frame, options: Options) -> taau.Estimate:
     """What one frame says of the lighting of each HR pixel, in the working space of TAAU."""
     lr = frame.lr
-    lighting = demodulate(frame.color_linear, guided.surface(lr)[0], surface=jnp.isfinite(lr.depth_linear))
-    lighting = taau.to_working(lighting, frame.exposure)
-    features = jnp.concatenate([lighting, guided.guide(lr), 1 / lr.depth_linear], -1)
-    alike = same_surface(frame.hr, options.sigma_guide)
+    lighting = guided.lighting_of(frame.color_linear, lr, options.eps)
+    features = jnp.concatenate(
+        [taau.to_working(lighting, frame.exposure), guided.guide(lr), 1 / lr.depth_linear], -1
+    )
+    alike = same_surface(frame.hr, options)
     return taau.estimate(features, frame.jitter_px, frame.scale, options.temporal, alike)
 
 
 def method(options: Options | None = None, reprojection: guided.Options | None = None) -> Method:
-    """Guided temporal upsampling, and guided reprojection where nothing was rendered."""
-    o = options or Options()
-    r = reprojection or guided.Options()
+    """Guided temporal upsampling, and guided reprojection where nothing was rendered.
 
-    def upscale(net: None, state: guided.State, frame: Frame) -> tuple[guided.State, Array]:
-        hr = frame.hr
+    Raises:
+        JaxsrError: an option out of range.
+    """
+    o, r = options or Options(), reprojection or guided.Options()
+    o.check()
+    r.check()
+
+    def upscale(net: None, state: taau.State, frame: Frame) -> tuple[taau.State, Array]:
         if frame.scale == 1:
             image = frame.color_linear
-            history = taau.State(image, jnp.full_like(hr.depth_linear, o.temporal.memory), hr.depth_linear)
-            return guided.State(history, *guided.surface(hr)), image
+            weight = jnp.full_like(frame.hr.depth_linear, o.temporal.memory)
+            return taau.State(guided.keep(image, frame), weight), image
+        last = state.last
+        assert last.depth_linear is not None
         now = estimate(frame, o)
-        previous = state.history
-        lighting = demodulate(previous.image, state.base_color, surface=jnp.isfinite(previous.depth_linear))
+        lighting = guided.lighting_of(last.image, last.gbuffer, o.eps)
         before, weight = taau.fetch_history(
-            taau.to_working(lighting, frame.exposure),
-            previous.weight,
-            previous.depth_linear,
-            frame,
-            o.temporal,
+            taau.to_working(lighting, frame.exposure), state.weight, last.depth_linear, frame, o.temporal
         )
         blended, weight = taau.accumulate(before, weight, now, o.temporal)
-        lighting = taau.from_working(blended, frame.exposure)
-        image = modulate(lighting, guided.surface(hr)[0], surface=jnp.isfinite(hr.depth_linear))
-        return guided.State(taau.State(image, weight, hr.depth_linear), *guided.surface(hr)), image
+        image = guided.color_of(taau.from_working(blended, frame.exposure), frame.hr, o.eps)
+        return taau.State(guided.keep(image, frame), weight), image
 
     return Method(
         "guided-taau",
         "TAAU of the lighting, weighted by HR G-buffers; guided reprojection where nothing was rendered",
+        Needs(BUFFERS | {"lr.color", "hr.motion"}, guided.BUFFERS),
         guided.init,
-        by_rendered(guided.init, upscale, lambda net, state, frame: guided.extrapolate(r, state, frame)),
-        frozenset(f"lr.{k}" for k in ("color", "depth", "base_color", "normal"))
-        | frozenset(f"hr.{k}" for k in ("depth", "motion", "base_color", "normal")),
+        upscale,
+        lambda net, state, frame: guided.extrapolate(r, state, frame),
     )

@@ -11,16 +11,16 @@ shift. Each Z F' is read once, bilinearly, 0 out of view: to warp such sparse ma
 them. The state keeps F' at LR and D, not Z F' or what was warped: to read a sample of F' takes one tap where
 Z F' takes four (`jaxsr.ops.warp_zero_upsampled`), and the network of previous frames runs once a frame.
 
-After a cut the missing frames are zeros, RGB-D too: their network is not asked. Training never sees that. A
-frame that was not rendered is made from the last output by a plain backward warp; it adds nothing to the
-history, but the paths lead through it.
+After a reset the missing history frames are all zeros. Training always has full windows, so the network never
+learned this case. A frame that was not rendered is made from the last output by a plain backward warp; it
+adds nothing to the history, but the paths lead through it.
 
 The loss is that of the other networks here, `1 - SSIM + 0.2 LPIPS`. The paper's second term is 0.1 times a
 distance of VGG-16's features; LPIPS is such a distance, over normalised and weighted features.
 """
 
-from dataclasses import asdict, dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,25 +29,27 @@ from jaxtyping import Array, Float, Int
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, Window
-from jaxsr.methods._network import ImageLoss, check_options, image_loss, last_output
-from jaxsr.methods.base import Loss, Method, Net, by_rendered
-from jaxsr.methods.fusion_sr import normalized_depth, sample_offset
+from jaxsr.methods.base import Method, Needs, Net, Network, Windows, last_frames, module_maker, one_image
+from jaxsr.methods.history import History, plain_warp
+from jaxsr.methods.image_loss import ImageLoss, check_loss, image_loss
+from jaxsr.methods.options import check_options, to_json
 from jaxsr.nets import NSRR
 from jaxsr.nets.nsrr import CHANNELS
 from jaxsr.ops import compose_motion, from_display, to_display, warp_zero_upsampled, zero_upsample
+from jaxsr.ops.encoding import normalized_depth, sample_offset
 
 
 @dataclass(frozen=True)
-class Options(ImageLoss):
-    """What is fixed when a network is made; recorded in its file of weights."""
+class Options:
+    """Settings of the network."""
 
     previous: int = 4
     """Rendered frames before the current one that the network sees."""
-    compute: Literal["float32", "bfloat16"] = "float32"
+    dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the convolutions and of the history; parameters and losses are float32."""
 
 
-class History(NamedTuple):
+class Previous(NamedTuple):
     """The last n rendered frames, the newest first; zeros where there were none."""
 
     features: Float[Array, "*b n h w 12"]
@@ -59,121 +61,118 @@ class History(NamedTuple):
 
 
 class State(NamedTuple):
-    """The history, and the last output, from which frames that are not rendered are made."""
+    """The previous frames, and the last output, from which frames that are not rendered are made."""
 
-    history: History
-    last: Any
+    previous: Previous
+    last: History
 
 
 def rgbd_input(frame: Frame) -> Float[Array, "*b h w 4"]:
     """x: what the network sees of a frame."""
-    color = to_display(frame.color_linear * frame.exposure[..., None, None, None])
-    return jnp.concatenate([color, normalized_depth(frame.lr.depth_linear)], -1)
+    return jnp.concatenate([to_display(frame.exposed), normalized_depth(frame.lr.depth_linear)], -1)
 
 
-def displayed(net: NSRR, frames: Frame, history: History) -> Float[Array, "b H W 3"]:
+def displayed(net: NSRR, frames: Frame, previous: Previous) -> Float[Array, "b H W 3"]:
     """A batch of frames through the network: HR colour, display-referred, not clipped.
 
     Args:
-        history: as these frames see it, with motion that begins in them.
+        net: the network.
+        frames: the current frames.
+        previous: the frames before, with motion that begins in the current ones.
     """
-    scale, motion = frames.scale, history.motion_px
+    scale, motion = frames.scale, previous.motion_px
     current = zero_upsample(net.features(rgbd_input(frames)), scale, sample_offset(frames.jitter_px, scale))
     paths = jnp.moveaxis(motion.reshape(*motion.shape[:-1], -1, 2), -2, 1)
-    previous = warp_zero_upsampled(history.features, paths, scale, history.offset)
-    return net.reconstruct(current, previous)
+    warped = warp_zero_upsampled(previous.features, paths, scale, previous.offset)
+    return net.reconstruct(current, warped)
 
 
-def longer(motion_px: Float[Array, "*b H W c"]) -> Float[Array, "*b H W c+2"]:
-    """The paths after a frame that joins the history: its own has no length yet."""
+def with_own_path(motion_px: Float[Array, "*b H W c"]) -> Float[Array, "*b H W c+2"]:
+    """The paths after a frame has joined the previous ones: its own path has no length yet."""
     return jnp.concatenate([jnp.zeros_like(motion_px, shape=(*motion_px.shape[:-1], 2)), motion_px], -1)
 
 
-def history_of(net: NSRR, frames: Frame) -> History:
-    """What the last of several frames, [B, T], sees of the others: all rendered, none but the first a cut."""
+def previous_of(net: NSRR, frames: Frame) -> Previous:
+    """What the last frame of each window, [B, T], sees of the others; no reset follows the first frame."""
     before = jax.tree.map(lambda x: x[:, -2::-1], frames)
     rgbd = rgbd_input(before)
     features = net.previous_features(rgbd.reshape(-1, *rgbd.shape[2:]))
     motion = frames.hr.motion_px
     paths = motion[:, 0, :, :, :0]
     for t in range(1, motion.shape[1]):
-        paths = compose_motion(motion[:, t], longer(paths))
-    return History(
+        paths = compose_motion(motion[:, t], with_own_path(paths))
+    return Previous(
         features.reshape(*rgbd.shape[:-1], CHANNELS), sample_offset(before.jitter_px, frames.scale), paths
     )
 
 
-def loss_of(options: Options) -> Loss:
-    """`1 - SSIM + 0.2 LPIPS` of the last frame of each window, display-referred."""
+def method(options: Options | None = None, loss: ImageLoss | None = None) -> Method:
+    """The network of these settings as a method.
 
-    def loss(net: nnx.Module, window: Window) -> tuple[Array, dict[str, Array]]:
-        assert isinstance(net, NSRR)
-        now = jax.tree.map(lambda x: x[:, -1], window.frames)
-        shown = displayed(net, now, history_of(net, window.frames))
-        truth = to_display(window.truth_linear[:, -1] * now.exposure[..., None, None, None])
-        return image_loss(shown, truth, options)
-
-    return loss
-
-
-def method(options: Options | None = None) -> Method:
-    """The network of these options as a method.
+    Args:
+        options: of the network.
+        loss: weights of the training's loss, `1 - SSIM + 0.2 LPIPS` by default.
 
     Raises:
         JaxsrError: an option that has no such value.
     """
-    o = options or Options()
+    o, weights = options or Options(), loss or ImageLoss()
     check_options(o)
+    check_loss(weights)
     if o.previous < 1:
         raise JaxsrError("bad previous", where="previous", expected="a whole number from 1", found=o.previous)
-    dtype = jnp.dtype(o.compute)
-    no_output, keep, extrapolate = last_output(False)
+    dtype = jnp.dtype(o.dtype)
 
-    def new_net(rngs: nnx.Rngs) -> NSRR:
+    def new(rngs: nnx.Rngs) -> NSRR:
         return NSRR(previous=o.previous, dtype=dtype, rngs=rngs)
 
-    def init(frame: Frame) -> State:
-        kept = 0 if frame.scale == 1 else o.previous  # full-size frames pass unchanged
-        size, hr_size = frame.color_linear.shape[:2], frame.hr.depth_linear.shape[:2]
-        history = History(
-            jnp.zeros((kept, *size, CHANNELS), dtype),
-            jnp.zeros((kept, 2), jnp.int32),
-            jnp.zeros((*hr_size, 2 * kept), frame.hr.motion_px.dtype),
-        )
-        return State(history, no_output(frame))
+    def loss_of(net: nnx.Module, window: Window) -> tuple[Array, dict[str, Array]]:
+        assert isinstance(net, NSRR)
+        now, truth = last_frames(window)
+        shown = displayed(net, now, previous_of(net, window.frames))
+        return image_loss(shown, to_display(truth * now.exposure[..., None, None, None]), weights)
 
-    def seen_from(frame: Frame, history: History) -> History:
-        return history._replace(motion_px=compose_motion(frame.hr.motion_px, history.motion_px))
+    module, warp = module_maker(new), plain_warp()
+
+    def init(frame: Frame) -> State:
+        count = 0 if frame.scale == 1 else o.previous  # full-size frames pass unchanged
+        previous = Previous(
+            jnp.zeros((count, *frame.color_linear.shape[:2], CHANNELS), dtype),
+            jnp.zeros((count, 2), jnp.int32),
+            jnp.zeros((*frame.size, 2 * count), frame.color_linear.dtype),
+        )
+        return State(previous, warp.init(frame))
+
+    def seen_from(frame: Frame, previous: Previous) -> Previous:
+        return previous._replace(motion_px=compose_motion(frame.hr.motion_px, previous.motion_px))
 
     def upscale(net: Net, state: State, frame: Frame) -> tuple[State, Array]:
         if frame.scale == 1:
-            return State(state.history, keep(frame.color_linear, frame)), frame.color_linear
-        model = nnx.merge(nnx.graphdef(nnx.eval_shape(lambda: new_net(nnx.Rngs(0)))), net)
-        history = seen_from(frame, state.history)
-        one, past = jax.tree.map(lambda x: jnp.asarray(x)[None], (frame, history))
-        shown = displayed(model, one, past)[0]
+            return State(state.previous, warp.keep(frame.color_linear, frame)), frame.color_linear
+        model, before = module(net), seen_from(frame, state.previous)
+        one, past = one_image((frame, before))
+        shown = displayed(model, one, past)[0].astype(frame.color_linear.dtype)
         image = from_display(jnp.clip(shown, 0, 1)) / frame.exposure
         features = model.previous_features(rgbd_input(one))
         offset = sample_offset(one.jitter_px, frame.scale)
-        history = History(
-            jnp.concatenate([features, history.features[:-1]]),
-            jnp.concatenate([offset, history.offset[:-1]]),
-            longer(history.motion_px)[..., :-2],
+        previous = Previous(
+            jnp.concatenate([features, before.features[:-1]]),
+            jnp.concatenate([offset, before.offset[:-1]]),
+            with_own_path(before.motion_px)[..., :-2],
         )
-        return State(history, keep(image, frame)), image
+        return State(previous, warp.keep(image, frame)), image
 
-    def pass_over(net: Net, state: State, frame: Frame) -> tuple[State, Array]:
-        last, image = extrapolate(net, state.last, frame)
-        return State(seen_from(frame, state.history), last), image
+    def extrapolate(net: Net, state: State, frame: Frame) -> tuple[State, Array]:
+        last, image = warp.extrapolate(net, state.last, frame)
+        return State(seen_from(frame, state.previous), last), image
 
+    windows = Windows(o.previous + 1)
     return Method(
         "nsrr",
         "network: the current and previous frames with depth; plain warp where nothing was rendered",
+        Needs(frozenset({"lr.color", "lr.depth", "hr.motion"}), warp.needs),
         init,
-        by_rendered(init, upscale, pass_over),
-        frozenset({"lr.color", "lr.depth", "hr.motion"}),
-        new_net=new_net,
-        loss=loss_of(o),
-        window=o.previous + 1,
-        arguments=asdict(o),
+        upscale,
+        extrapolate,
+        Network(new, loss_of, windows, to_json(o), to_json(weights)),
     )

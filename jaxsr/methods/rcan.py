@@ -1,23 +1,24 @@
 """RCAN (Zhang et al., ECCV 2018; METHODS 6): a deep network makes each frame from its colour alone.
 
-    O_J = net(I_J)          `jaxsr.nets.RCAN`; colours and jitter as in `jaxsr.methods._color`
+    O_J = net(I_J)          `jaxsr.nets.RCAN`; colours and jitter as in `jaxsr.methods.color_only`
 
-What G-buffers and history are worth is seen against it. A frame that was not rendered is the last output
-warped backward by the HR motion: all that it needs besides colour.
+It shows what G-buffers and history are worth. A frame that was not rendered is the last output, warped
+backward along the HR motion, which is all that the method needs besides colour.
 """
 
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
-import jax
 import jax.numpy as jnp
 from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxsr.frames import Frame, Window
-from jaxsr.methods._color import ColorOptions, check_scale, color_input, shown, to_linear
-from jaxsr.methods._network import check_options, image_loss, last_output
-from jaxsr.methods.base import Loss, Method, Net, by_rendered
+from jaxsr.methods.base import Method, Needs, Net, Network, last_frames, module_maker, one_image
+from jaxsr.methods.color_only import ColorOptions, check_scale, color_input, to_linear, unjittered
+from jaxsr.methods.history import plain_warp
+from jaxsr.methods.image_loss import ImageLoss, L1Loss, check_loss, image_loss
+from jaxsr.methods.options import check_options, to_json
 from jaxsr.nets import RCAN
 from jaxsr.nets.rcan import check_sizes
 from jaxsr.ops import to_display
@@ -25,12 +26,12 @@ from jaxsr.ops import to_display
 
 @dataclass(frozen=True)
 class Options(ColorOptions):
-    """What is fixed when a network is made; recorded in its file of weights."""
+    """Settings of the network; the published ones by default."""
 
     groups: int = 10
     """Residual groups."""
     blocks: int = 20
-    """Residual channel attention blocks of each group."""
+    """Residual channel attention blocks per group."""
     features: int = 64
     """Channels."""
     reduction: int = 16
@@ -44,50 +45,48 @@ def displayed(net: Callable[..., Array], frames: Frame, options: Options) -> Flo
         JaxsrError: frames of another scale.
     """
     check_scale(frames, options)
-    return shown(net(color_input(frames)), frames.jitter_px, options)
+    return unjittered(net(color_input(frames)), frames.jitter_px, options)
 
 
-def loss_of(options: Options) -> Loss:
-    """L1 on display-referred colour, and what else is asked for."""
+def method(options: Options | None = None, loss: ImageLoss | None = None) -> Method:
+    """The network of these settings as a method.
 
-    def loss(net: nnx.Module, window: Window) -> tuple[Array, dict[str, Array]]:
-        frames = jax.tree.map(lambda x: x[:, -1], window.frames)
-        truth = to_display(window.truth_linear[:, -1] * frames.exposure[..., None, None, None])
-        return image_loss(displayed(net, frames, options), truth, options)
-
-    return loss
-
-
-def method(options: Options | None = None) -> Method:
-    """The network of these options as a method.
+    Args:
+        options: of the network.
+        loss: weights of the training's loss, L1 by default.
 
     Raises:
         JaxsrError: an option that has no such value.
     """
-    o = options or Options()
+    o, weights = options or Options(), loss or L1Loss()
     check_options(o)
+    check_loss(weights)
     sizes = {"groups": o.groups, "blocks": o.blocks, "features": o.features, "reduction": o.reduction}
     check_sizes(o.scale, **sizes)
-    init, keep, extrapolate = last_output(False)
 
-    def new_net(rngs: nnx.Rngs) -> nnx.Module:
-        return RCAN(scale=o.scale, **sizes, dtype=jnp.dtype(o.compute), rngs=rngs)
+    def new(rngs: nnx.Rngs) -> nnx.Module:
+        return RCAN(scale=o.scale, **sizes, dtype=jnp.dtype(o.dtype), rngs=rngs)
+
+    def loss_of(net: nnx.Module, window: Window) -> tuple[Array, dict[str, Array]]:
+        frames, truth = last_frames(window)
+        truth = to_display(truth * frames.exposure[..., None, None, None])
+        return image_loss(displayed(net, frames, o), truth, weights)
+
+    module, warp = module_maker(new), plain_warp()
 
     def upscale(net: Net, state: object, frame: Frame) -> tuple[object, Array]:
         if frame.scale == 1:
-            return keep(frame.color_linear, frame), frame.color_linear
-        model = nnx.merge(nnx.graphdef(nnx.eval_shape(lambda: new_net(nnx.Rngs(0)))), net)
-        one = jax.tree.map(lambda x: jnp.asarray(x)[None], frame)
-        image = to_linear(displayed(model, one, o), one.exposure)[0]
-        return keep(image, frame), image
+            return warp.keep(frame.color_linear, frame), frame.color_linear
+        one = one_image(frame)
+        image = to_linear(displayed(module(net), one, o), one.exposure)[0].astype(frame.color_linear.dtype)
+        return warp.keep(image, frame), image
 
     return Method(
         "rcan",
         "network: the colour of the current frame alone; plain backward warp where nothing was rendered",
-        init,
-        by_rendered(init, upscale, extrapolate),
-        frozenset({"lr.color", "hr.motion"}),
-        new_net=new_net,
-        loss=loss_of(o),
-        arguments=asdict(o),
+        Needs(frozenset({"lr.color"}), warp.needs),
+        warp.init,
+        upscale,
+        warp.extrapolate,
+        Network(new, loss_of, settings=to_json(o), loss_settings=to_json(weights)),
     )

@@ -28,8 +28,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame
-from jaxsr.methods.base import Method, by_rendered
+from jaxsr.methods.base import Method, Needs
+from jaxsr.methods.history import History, no_image
+from jaxsr.methods.options import check_options
 from jaxsr.ops import (
     backward_warp,
     inverse_tone_map,
@@ -57,19 +60,26 @@ class Options:
     depth_tolerance: float = 0.02
     """Relative change of depth from frame to frame that counts as the same surface."""
 
+    def check(self) -> None:
+        """Raise JaxsrError for an option out of range."""
+        check_options(self)
+        for name in ("kernel_sigma", "sample_sigma", "floor", "memory"):
+            if not getattr(self, name) > 0:
+                raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=0)
+
 
 class State(NamedTuple):
-    """The history: linear colour, its weight, and the depth it was seen at."""
+    """The history, and what each of its pixels is worth."""
 
-    image: Float[Array, "H W 3"]
+    last: History
+    """The last output, and the depth that it was seen at; `guided` keeps its surface as well."""
     weight: Float[Array, "H W 1"]
-    depth_linear: Float[Array, "H W 1"]
 
 
 def init(frame: Frame) -> State:
     """An empty history."""
-    depth = frame.hr.depth_linear
-    return State(jnp.zeros((*depth.shape[:-1], 3), depth.dtype), jnp.zeros_like(depth), jnp.zeros_like(depth))
+    depth = jnp.zeros_like(frame.hr.depth_linear)
+    return State(History(no_image(frame), depth_linear=depth), depth)
 
 
 def to_working(color_linear: Float[Array, "H W 3"], exposure: Float[Array, ""]) -> Float[Array, "H W 3"]:
@@ -248,31 +258,42 @@ def _all_alike(features: Float[Array, "H W g"]) -> Float[Array, "H W 1"]:
 
 
 def method(options: Options | None = None) -> Method:
-    """TAAU with these options."""
+    """TAAU with these options.
+
+    Raises:
+        JaxsrError: an option out of range.
+    """
     o = options or Options()
+    o.check()
 
     def upscale(net: None, state: State, frame: Frame) -> tuple[State, Array]:
         depth = frame.hr.depth_linear
         if frame.scale == 1:  # every pixel was sampled: nothing to accumulate
             image = frame.color_linear
-            return State(image, jnp.full_like(depth, o.memory), depth), image
+            return State(History(image, depth), jnp.full_like(depth, o.memory)), image
         color = to_working(frame.color_linear, frame.exposure)
         now = estimate(color, frame.jitter_px, frame.scale, o, _all_alike)
-        history = to_working(state.image, frame.exposure)
-        before, weight = fetch_history(history, state.weight, state.depth_linear, frame, o)
+        last = state.last
+        assert last.depth_linear is not None
+        history = to_working(last.image, frame.exposure)
+        before, weight = fetch_history(history, state.weight, last.depth_linear, frame, o)
         blended, weight = accumulate(before, weight, now, o)
         image = from_working(blended, frame.exposure)
-        return State(image, weight, depth), image
+        return State(History(image, depth), weight), image
 
     def extrapolate(net: None, state: State, frame: Frame) -> tuple[State, Array]:
-        image = backward_warp(state.image, frame.hr.motion_px, mode="bilinear")
-        _, weight = fetch_history(state.image[..., :0], state.weight, state.depth_linear, frame, o)
-        return State(image, weight, frame.hr.depth_linear), image
+        last = state.last
+        assert last.depth_linear is not None
+        image = backward_warp(last.image, frame.hr.motion_px, mode="bilinear")
+        _, weight = fetch_history(last.image[..., :0], state.weight, last.depth_linear, frame, o)
+        return State(History(image, frame.hr.depth_linear), weight), image
 
+    geometry = frozenset({"hr.depth", "hr.motion"})
     return Method(
         "taau",
         "temporal upsampling of jittered frames; plain backward warp where nothing was rendered",
+        Needs(geometry | {"lr.color"}, geometry),
         init,
-        by_rendered(init, upscale, extrapolate),
-        frozenset({"lr.color", "hr.depth", "hr.motion"}),
+        upscale,
+        extrapolate,
     )

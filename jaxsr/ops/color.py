@@ -19,7 +19,7 @@ from jaxsr.errors import JaxsrError
 
 KINDS = ("aces", "reinhard", "log")
 
-_ACES_WHITE = 7.2416735
+WHITE = 7.2416735
 """Linear value at which the fit reaches 1: the positive root of 0.08 x^2 - 0.56 x - 0.14."""
 
 
@@ -50,7 +50,7 @@ def tone_map(color_linear: Float[Array, "*n"], kind: str = "aces") -> Float[Arra
     _check_kind(kind)
     x = _floor(color_linear)
     if kind == "aces":
-        x = _ceil(x, _ACES_WHITE)
+        x = _ceil(x, WHITE)
         return _ceil(x * (2.51 * x + 0.03) / (x * (2.43 * x + 0.59) + 0.14), 1.0)
     if kind == "reinhard":
         # The second form does not overflow, the first keeps the precision of dark values.

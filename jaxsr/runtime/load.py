@@ -3,7 +3,7 @@
 import importlib.resources
 import re
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from flax import nnx
 
@@ -11,7 +11,8 @@ import jaxsr
 from jaxsr.errors import JaxsrError
 from jaxsr.methods import METHODS, Method, build
 from jaxsr.methods.base import Net
-from jaxsr.weights.file import into, load_weights
+from jaxsr.methods.legacy import upgrade
+from jaxsr.weights.file import FORMAT, into, load_weights
 
 
 class LoadedMethod(NamedTuple):
@@ -20,7 +21,7 @@ class LoadedMethod(NamedTuple):
     method: Method
     """Named as it was asked for; a file of weights gives its name, or that of its folder (`weights_name`)."""
     net: Net = None
-    """Of a network, its state; None where nothing is learned."""
+    """State of the network; None where nothing is learned."""
     weights: Path | None = None
     """The file that the state was read from."""
 
@@ -32,11 +33,11 @@ def weights_folder() -> Path:
 
 def shipped_scales(name: str) -> list[int]:
     """Scales for which weights of that name ship with the package."""
-    found = (
+    matches = (
         re.fullmatch(rf"{re.escape(name)}-x(\d+)", path.stem)
         for path in weights_folder().glob("*.safetensors")
     )
-    return sorted(int(match[1]) for match in found if match)
+    return sorted(int(match[1]) for match in matches if match)
 
 
 def shipped_names() -> list[str]:
@@ -67,19 +68,19 @@ def find_method(name: str, scale: int) -> LoadedMethod:
     """
     if name.endswith(".safetensors"):
         path = Path(name)
-        return _with_weights(weights_name(path), path, scale)
+        return load_method(path, scale, weights_name(path))
     if (card := weights_folder() / f"{name}.safetensors").is_file():
-        return _with_weights(name, card, scale)
+        return load_method(card, scale, name)
     scales = shipped_scales(name)
     if scale in scales:
-        return _with_weights(name, weights_folder() / f"{name}-x{scale}.safetensors", scale)
+        return load_method(weights_folder() / f"{name}-x{scale}.safetensors", scale, name)
     if name not in METHODS and not scales:
         raise JaxsrError(
             f"unknown method {name!r}",
             expected="one of " + ", ".join(dict.fromkeys([*METHODS, *shipped_names()])),
             fix="or the path of a file of weights, *.safetensors",
         )
-    if scales or METHODS[name].new_net is not None:
+    if scales or METHODS[name].network is not None:
         raise JaxsrError(
             f"no weights of {name!r} for scale {scale}",
             expected=f"scale {' or '.join(map(str, scales))}" if scales else None,
@@ -89,15 +90,51 @@ def find_method(name: str, scale: int) -> LoadedMethod:
     return LoadedMethod(METHODS[name])
 
 
-def _with_weights(name: str, path: Path, scale: int) -> LoadedMethod:
-    arrays, header = load_weights(path)
-    trained, arguments = header.get("scale"), header.get("arguments", {})
-    if not isinstance(trained, int) or not isinstance(arguments, dict):
+def settings_of(header: dict[str, Any], path: Path) -> dict[str, Any]:
+    """The settings that the header of a file of weights records, also of files of earlier versions.
+
+    Raises:
+        JaxsrError: the header is damaged, or of a later version.
+    """
+    version = header.get("format", 1)
+    if version not in (1, FORMAT):
+        raise JaxsrError(
+            "weights of another version", where=path, expected=FORMAT, found=version, fix="update jaxsr"
+        )
+    settings = header.get("arguments" if version == 1 else "settings", {})
+    if not isinstance(settings, dict):
         raise JaxsrError(
             "the header of the weights is damaged",
             where=path,
-            expected="a whole number as scale, an object as arguments",
-            found=f"scale {trained}, arguments {arguments}",
+            expected="settings as an object",
+            found=settings,
+        )
+    return upgrade(str(header["method"]), settings) if version == 1 else settings
+
+
+def method_of_header(header: dict[str, Any], path: Path) -> Method:
+    """The method that the header of a file of weights describes.
+
+    Raises:
+        JaxsrError: the header is damaged, or names settings that the method does not have.
+    """
+    return build(str(header["method"]), settings_of(header, path), path)
+
+
+def load_method(path: Path, scale: int, name: str) -> LoadedMethod:
+    """The method of a file of weights, under a name.
+
+    Raises:
+        JaxsrError: the file is damaged, of another scale, or does not fit the method.
+    """
+    arrays, header = load_weights(path)
+    trained = header.get("scale")
+    if not isinstance(trained, int):
+        raise JaxsrError(
+            "the header of the weights is damaged",
+            where=path,
+            expected="a whole number as scale",
+            found=f"scale {trained}",
         )
     if trained != scale:
         raise JaxsrError(
@@ -107,8 +144,8 @@ def _with_weights(name: str, path: Path, scale: int) -> LoadedMethod:
             found=f"scale {trained}",
             fix=f"choose --scale {trained}, or other weights",
         )
-    method = build(str(header["method"]), arguments)
-    assert method.new_net is not None  # `build` knows only methods that learn
-    new_net = method.new_net
-    empty = nnx.state(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))))
+    method = method_of_header(header, path)
+    network = method.network
+    assert network is not None  # `build` knows only methods that learn
+    empty = nnx.state(nnx.eval_shape(lambda: network.new(nnx.Rngs(0))), nnx.Not(nnx.RngState))
     return LoadedMethod(method._replace(name=name), into(empty, arrays, path), path)

@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame
-from jaxsr.io.sequence import Sequence, prefetch
+from jaxsr.io.sequence import DERIVED, Sequence, prefetch
 from jaxsr.methods import Method
 
 
@@ -29,24 +29,35 @@ def rendered_schedule(sequence: Sequence, every: int) -> list[bool]:
     return rendered
 
 
-def observed(sequence: Sequence, scale: int, every: int = 1) -> Iterator[Frame]:
-    """The frames as a method may see them, read ahead in a thread."""
+def observed(sequence: Sequence, method: Method, scale: int, every: int = 1) -> Iterator[Frame]:
+    """The frames as a method may see them, with the buffers that it needs; read ahead in a thread."""
     schedule = rendered_schedule(sequence, every)
-    return prefetch(sequence.frame(i, scale, rendered=rendered) for i, rendered in enumerate(schedule))
+    needs = {rendered: method.needs.of(rendered, not all(schedule)) for rendered in (True, False)}
+    return prefetch(
+        sequence.frame(i, scale, rendered=rendered, needs=needs[rendered])
+        for i, rendered in enumerate(schedule)
+    )
 
 
-def check_needs(method: Method, sequence: Sequence, scale: int) -> None:
-    """Say at once what a sequence lacks for a method.
+def available(sequence: Sequence, scale: int) -> frozenset[str]:
+    """The buffers that frames can have, by place and layer, from the headers of the first frame's files."""
+    have = {f"lr.{layer}" for layer in sequence.layers("hr" if scale == 1 else f"x{scale}")}
+    if scale > 1 and have >= {f"lr.{layer}" for layer in DERIVED}:
+        have |= {f"hr.{layer}" for layer in DERIVED}
+    if sequence.hr:
+        have |= {f"hr.{layer}" for layer in sequence.layers("hr")}
+    return frozenset(have)
+
+
+def check_needs(method: Method, sequence: Sequence, scale: int, every: int = 1) -> None:
+    """Say at once what a sequence lacks for a method, from the headers of its first files.
 
     Raises:
-        JaxsrError: the first frame has not all the buffers.
+        JaxsrError: the first frame does not have all the buffers, or motion is zero where the camera moves.
     """
-    frame = sequence.frame(0, scale)
-    buffers = {"lr": frame.lr._asdict(), "hr": frame.hr._asdict()}
-    have = {"lr.color"}
-    for place, layers in buffers.items():
-        have |= {f"{place}.{_layer(name)}" for name, value in layers.items() if value is not None}
-    missing = sorted(method.needs - have)
+    needs = method.needs.of(True, every > 1)
+    have = available(sequence, scale)
+    missing = sorted(needs - have)
     if missing:
         raise JaxsrError(
             f"method {method.name!r} needs {', '.join(missing)}",
@@ -55,17 +66,14 @@ def check_needs(method: Method, sequence: Sequence, scale: int) -> None:
             fix="export these buffers, or choose a method that does without (jaxsr inspect lists them)",
         )
     cameras = all(info.has_camera for info in sequence.infos[:2])
-    if cameras and "hr.motion" in method.needs and len(sequence) > 1 and not sequence.infos[1].reset:
+    if cameras and "hr.motion" in needs and len(sequence) > 1 and not sequence.infos[1].reset:
         before, after = (np.asarray(info.world_from_view) for info in sequence.infos[:2])
-        motion = np.asarray(sequence.frame(1, scale, rendered=False).hr.motion_px)
-        if not motion.any() and not np.allclose(before, after, atol=1e-6):
+        frame = sequence.frame(1, scale, rendered=False, needs=frozenset({"hr.motion"}))
+        still = np.allclose(before, after, atol=1e-6)
+        if not np.asarray(frame.hr.motion_px).any() and not still:
             raise JaxsrError(
                 "motion is zero everywhere, yet the camera moves",
                 where=f"{sequence.path}, frame {sequence.infos[1].index}",
                 expected="backward motion in pixels",
                 fix="export motion vectors (see jaxsr inspect), or choose a method that does without",
             )
-
-
-def _layer(field: str) -> str:
-    return field.removesuffix("_linear").removesuffix("_px")

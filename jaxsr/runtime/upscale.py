@@ -124,7 +124,7 @@ def upscale(
             folder holds frames of another run or files that jaxsr did not write (`claim_folder`).
     """
     rendered_schedule(sequence, every)
-    check_needs(loaded.method, sequence, scale)
+    check_needs(loaded.method, sequence, scale, every)
     claim_folder(out, describe_run(sequence, scale, every, loaded.method.name, loaded.weights))
     clock = Clock()
     for made in write_frames(sequence, loaded, out, scale, every):

@@ -1,6 +1,7 @@
 """`jaxsr train METHOD`: the options of a training and those of a method, as one command line."""
 
 import dataclasses
+import sys
 from collections.abc import Sequence
 from typing import Annotated, Any
 
@@ -40,24 +41,65 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
             expected=f"one of {', '.join(learned)}",
             fix="name it before the options",
         )
-    options = learned[name].options
-    for_one_scale = any(field.name == "scale" for field in dataclasses.fields(options))
-    if for_one_scale:  # that of the training: one option, not two
-        hidden = [("scale", Annotated[int, tyro.conf.Suppress], 1)]
-        options = dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
-    both = dataclasses.make_dataclass(
-        "both", [("training", TrainConfig, TrainConfig()), ("method", options, options())]
-    )
+    options, loss = learned[name].options, learned[name].loss
+    has_scale = any(field.name == "scale" for field in dataclasses.fields(options))
+    groups = [
+        ("training", TrainConfig, TrainConfig()),
+        ("method", _without_groups(options), options()),
+        ("loss", loss, loss()),
+    ]
     chosen: Any = tyro.cli(
-        both,
-        args=rest,
+        dataclasses.make_dataclass("TrainingAndMethod", groups),
+        args=_renamed(rest),
         prog=f"jaxsr train {name}",
         description=DESCRIPTION,
         config=(tyro.conf.OmitArgPrefixes,),
     )
-    config, chosen_options = chosen.training, chosen.method
-    if for_one_scale:
-        chosen_options = dataclasses.replace(chosen_options, scale=config.scale)
-    method = learned[name].method(chosen_options)
+    config, settings = chosen.training, chosen.method
+    if has_scale:
+        settings = dataclasses.replace(settings, scale=config.scale)
+    method = learned[name].method(settings, chosen.loss)
     weights = train(method, config)
     print(f"{weights}: use it with `jaxsr upscale SEQ --method {weights} --scale {config.scale}`")
+
+
+def _without_groups(options: type) -> Any:
+    """The options without what the command line does not offer: constants of filters, and a second scale."""
+    hidden = [
+        (field.name, Annotated[field.type, tyro.conf.Suppress], field.default)
+        for field in dataclasses.fields(options)
+        if dataclasses.is_dataclass(field.type) or field.name == "scale"
+    ]
+    if not hidden:
+        return options
+    return dataclasses.make_dataclass(options.__name__, hidden, bases=(options,), frozen=True)
+
+
+_OLD_NAMES = {
+    "--follow-jitter": "--unjitter",
+    "--no-follow-jitter": "--no-unjitter",
+    "--compute": "--dtype",
+    "--start": "--base",
+    "--color": "",
+}
+
+
+def _renamed(arguments: Sequence[str]) -> list[str]:
+    """The arguments with the names that options have now; old ones still work, and a line says so."""
+    new: list[str] = []
+    rest = iter(arguments)
+    for argument in rest:
+        name, equals, value = argument.partition("=")
+        if name not in _OLD_NAMES:
+            new.append(argument)
+            continue
+        if name == "--color":
+            now = ["--demodulated" if (value or next(rest, "")) == "lighting" else "--no-demodulated"]
+        elif name == "--start":
+            choice = value or next(rest, "")
+            now = ["--base", "none" if choice == "nothing" else choice]
+        else:
+            now = [_OLD_NAMES[name] + equals + value]
+        print(f"jaxsr train: {name} is now {' '.join(now)}; the old name will go", file=sys.stderr)
+        new += now
+    return new

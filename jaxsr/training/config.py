@@ -91,9 +91,11 @@ def describe(
     method: Method, config: TrainConfig, trained_on: List[Path], evaluated_on: List[Path]
 ) -> dict[str, Any]:
     """All that `config.json` records, as JSON types."""
+    assert method.network is not None
     return {
         "method": method.name,
-        "arguments": dict(method.arguments),
+        "settings": dict(method.network.settings),
+        "loss": dict(method.network.loss_settings),
         "config": json.loads(json.dumps(dataclasses.asdict(config), default=str)),
         "sequences": [identity(path) for path in trained_on],
         "evaluated": [identity(path) for path in evaluated_on],
@@ -162,7 +164,7 @@ def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     def flat(record: dict[str, Any]) -> dict[str, Any]:
         kept = {k: v for k, v in record["config"].items() if k not in MAY_CHANGE}
         data = {k: record[k] for k in ("method", "sequences", "evaluated")} | {"init": record.get("init")}
-        return data | kept | json.loads(json.dumps(record["arguments"], default=list))
+        return data | kept | record["settings"] | record["loss"]
 
     a, b = flat(old), flat(new)
     if b["init"] == MISSING and a["init"] is not None:  # it has served

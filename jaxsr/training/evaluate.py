@@ -11,6 +11,7 @@ from jaxtyping import Float
 from jaxsr.data.windows import WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.methods import Method
+from jaxsr.methods.base import step
 from jaxsr.metrics import psnr, ssim
 from jaxsr.ops import to_display
 from jaxsr.progress import Progress, silent
@@ -81,7 +82,7 @@ class Evaluator:
             names.append(f"{clip.name} {clip.infos[start + window - 1].index}")
         self.frames = ", ".join(names) + (", held back from training" if held_back else "")
         self.sequences = [clip.path for clip in self._source.sequences]
-        self._init, self._step = jax.jit(method.init), jax.jit(method.step)
+        self._init, self._step = jax.jit(method.init), jax.jit(step(method))
 
     def __call__(self, net: Any) -> Evaluation:
         """Run the step with the net (an `nnx.State`), and measure.

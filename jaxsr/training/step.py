@@ -48,8 +48,8 @@ def make_step(method: Method, graphdef: nnx.GraphDef, config: TrainConfig, whole
 
     `measured` holds "loss", its parts as "loss/<name>", and "grad_norm" before clipping.
     """
-    assert method.loss is not None
-    loss, tx = method.loss, optimizer(config)
+    assert method.network is not None
+    loss, tx = method.network.loss, optimizer(config)
 
     def loss_of(params: Net, rest: Net, window: Window):
         net = nnx.merge(graphdef, params, rest, copy=True)  # new variables, that this trace may change

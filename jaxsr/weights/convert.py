@@ -6,11 +6,10 @@ from typing import Any
 
 from flax import nnx
 
-import jaxsr
 from jaxsr.errors import JaxsrError
 from jaxsr.files import file_digest
-from jaxsr.methods import build
-from jaxsr.weights.file import into, save_weights
+from jaxsr.methods import variant
+from jaxsr.weights.file import into, new_header, save_weights
 from jaxsr.weights.names import PUBLISHED, method_of, translate
 from jaxsr.weights.torch import read_published
 
@@ -36,7 +35,7 @@ def convert_published(
         half: store float16.
 
     Returns:
-        The header of the file: "method", its "arguments", and more.
+        The header of the file: "method", its "settings", and more.
 
     Raises:
         JaxsrError: no such method, a file that cannot be read, or weights that do not fit the method.
@@ -55,16 +54,11 @@ def convert_published(
     trained = arguments.get("scale", scale or PUBLISHED[method].scale)
     if scale not in (None, trained):
         raise JaxsrError("the weights are of another scale", where=source, expected=scale, found=trained)
-    new_net = build(method, arguments).new_net
-    assert new_net is not None  # `build` knows only methods that learn
-    net = nnx.eval_shape(lambda: new_net(nnx.Rngs(0)))
+    network = variant(method, arguments).network
+    assert network is not None  # `variant` knows only methods that learn
+    net = nnx.eval_shape(lambda: network.new(nnx.Rngs(0)))
     state = into(nnx.state(net), translate(method, net, published, source), source)
-    header = {
-        "method": method,
-        "arguments": arguments,
-        "scale": trained,
-        "jaxsr": jaxsr.__version__,
-        "source": {"file": source.name, "sha256": file_digest(source)},
-    }
+    origin = {"file": source.name, "sha256": file_digest(source)}
+    header = new_header(method, network.settings, trained, source=origin)
     save_weights(out, state, header, half=half)
     return header

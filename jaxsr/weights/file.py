@@ -1,9 +1,10 @@
 """Weights as safetensors with a header: nothing in them is executed when they are loaded.
 
 A file holds one array per parameter or batch statistic, named by its place in the network
-("decoder1.up.kernel"), and one metadata entry, `jaxsr`: a JSON object with at least `method`, `arguments` and
-`scale`, from which `jaxsr.methods.build` makes the method again. Arrays are float32, or float16 at half the
-size; loaded, they are float32 either way. `jaxsr.weights.torch` reads the weights of other programs.
+("decoder1.up.kernel"), and one metadata entry, `jaxsr`: a JSON object (`new_header`) with at least `method`,
+`settings` and `scale`, from which `jaxsr.methods.build` makes the method again. Arrays are float32, or
+float16 at half the size; loaded, they are float32 either way. `jaxsr.weights.torch` reads those of other
+programs.
 """
 
 import itertools
@@ -19,6 +20,7 @@ from flax import nnx
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+import jaxsr
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path, open_file, parse_json
 from jaxsr.weights.archives import Budget, check_file
@@ -26,6 +28,8 @@ from jaxsr.weights.pickles import shortened
 
 State: TypeAlias = Any
 """An `nnx.State`; not annotated as one, for its own annotations are of a kind that beartype rejects."""
+FORMAT = 2
+"""Of the header. Files without a number are of version 1: `jaxsr.methods.legacy` reads their settings."""
 KEY = "jaxsr"
 """The name of the metadata entry that holds the header."""
 HEADER_BYTES = 16 << 20
@@ -40,6 +44,25 @@ def flatten(state: State) -> dict[str, np.ndarray]:
     }
 
 
+def new_header(method: str, settings: Mapping[str, Any], scale: int, **more: Any) -> dict[str, Any]:
+    """The header of a file of weights.
+
+    Args:
+        method: its name.
+        settings: all that its output depends on besides the arrays (`Network.settings`).
+        scale: HR size over LR size that the weights are made for.
+        **more: whatever else should be known of them, as JSON values.
+    """
+    return {
+        "format": FORMAT,
+        "method": method,
+        "settings": dict(settings),
+        "scale": scale,
+        "jaxsr": jaxsr.__version__,
+        **more,
+    }
+
+
 def save_weights(
     path: str | Path,
     state: State | Mapping[str, np.ndarray],
@@ -51,7 +74,7 @@ def save_weights(
     Args:
         path: of the file.
         state: parameters and batch statistics, as a state or already by name.
-        header: JSON values; `method`, `arguments` and `scale`, and whatever else should be known of them.
+        header: see `new_header`.
         half: store float16, rounded to nearest.
 
     Raises:

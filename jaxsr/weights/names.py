@@ -72,9 +72,9 @@ def fusion_sr_arguments(
         "architecture": "unet" if is_unet else "fusion",
         "buffers": list(chosen),
         "down_kernel": int(down.shape[2]),
-        "color": "display",
-        "start": "nothing",
-        "follow_jitter": False,
+        "demodulated": False,
+        "base": "none",
+        "unjitter": False,
     }
     if not is_unet:
         has_modules = any(name.startswith("fusion_reconstruct.fuse") for name in published)

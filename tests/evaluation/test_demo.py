@@ -84,7 +84,7 @@ def test_truth_is_never_seen(name, tmp_path):
         nan = {k: np.full_like(v, np.nan) for k, v in channels.items() if k.startswith("color.")}
         assert len(nan) == 3
         write_exr(file, channels | nan, metadata)
-    learned = METHODS[name].new_net is not None
+    learned = METHODS[name].network.new is not None
     given = random_weights(tmp_path / f"{name}.safetensors", scale=2, method=name) if learned else name
     method = find_method(str(given), 2)
     for sequence, out in ((clean, "a"), (poisoned, "b")):

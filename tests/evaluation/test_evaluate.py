@@ -277,7 +277,7 @@ def test_methods_are_found(data, tmp_path, monkeypatch):
     assert shipped_scales("fusion-sr-hall") == [2]
     ready = find_method("fusion-sr-hall", 2)
     assert ready.method.name == "fusion-sr-hall"
-    assert ready.method.needs == METHODS["fusion-sr"].needs
+    assert ready.method.needs.of(True) == METHODS["fusion-sr"].needs.of(True)
     names = ["fusion-sr", saved("run/weights"), saved("run/best")]
     assert [r.method.name for r in find_methods(names, 2)] == ["fusion-sr", "run", "run-best"]
     monkeypatch.chdir(tmp_path / "run")

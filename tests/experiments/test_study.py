@@ -50,7 +50,7 @@ def made(name, seed=0, psnr=20.0, **changes):
         found |= {
             "seed": seed,
             "config": config | {"schedule": "cosine", "clip_norm": 1.0},
-            "arguments": json.loads(json.dumps(dict(study.VARIANTS[name].build().arguments))),
+            "arguments": json.loads(json.dumps(dict(study.VARIANTS[name].build().network.settings))),
             "sequences": ["clip hash"],
             "trained": {"commit": "abc", "device": "cpu", "seconds": 3600},
         }
@@ -60,7 +60,7 @@ def made(name, seed=0, psnr=20.0, **changes):
 @pytest.mark.parametrize("name", LEARNING)
 def test_a_variant_is_the_network_that_its_label_says(name):
     method = study.VARIANTS[name].build()
-    state = nnx.eval_shape(lambda: nnx.state(method.new_net(nnx.Rngs(0))))
+    state = nnx.eval_shape(lambda: nnx.state(method.network.new(nnx.Rngs(0))))
     count = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.filter_state(state, nnx.Param)))
     expected = {
         "nsrr": 547_767,
@@ -72,9 +72,9 @@ def test_a_variant_is_the_network_that_its_label_says(name):
         word for word in ("depth", "base-color", "normal", "roughness", "metallic") if f"no-{word}" == name
     }
     if seen:
-        assert not {f"hr.{word.replace('-', '_')}" for word in seen} & method.needs
-    assert method.arguments["ssim_weight"] == method.arguments["l1_weight"] == 1
-    assert method.arguments["perceptual_weight"] == 0
+        assert not {f"hr.{word.replace('-', '_')}" for word in seen} & method.needs.of(True)
+    assert method.network.settings["ssim_weight"] == method.network.settings["l1_weight"] == 1
+    assert method.network.settings["perceptual_weight"] == 0
 
 
 def test_names_are_checked_before_any_work(tmp_path):

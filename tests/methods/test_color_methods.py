@@ -9,13 +9,14 @@ import numpy as np
 import optax
 import pytest
 from flax import nnx
+from jaxsr.methods._color import ColorOptions, without_jitter
 
 from jaxsr.data.windows import WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.io.images import read_png
 from jaxsr.methods import LEARNED, METHODS, build, rcan, rrn
-from jaxsr.methods._color import ColorOptions, without_jitter
+from jaxsr.methods.base import step
 from jaxsr.ops import backward_warp, from_display, sample_jittered, to_display, upsample
 from jaxsr.runtime.load import find_method
 from jaxsr.training import TrainConfig, train
@@ -35,12 +36,12 @@ def method_of(name, **arguments):
 
 @functools.cache
 def state_of(name, seed=0):
-    return nnx.state(drawn(lambda rngs: method_of(name).new_net(rngs), seed))
+    return nnx.state(drawn(lambda rngs: method_of(name).network.new(rngs), seed))
 
 
 @functools.cache
 def step_of(name):
-    return jax.jit(method_of(name).step)
+    return jax.jit(step(method_of(name)))
 
 
 def clip():
@@ -114,12 +115,12 @@ def test_a_ramp_is_where_it_was_before_the_jitter(scale):
 def test_a_network_that_is_bilinear_gives_what_bilinear_gives():
     """RRN without weights, up to the second interpolation; not so if the jitter is left in."""
     frame = frame_at(0, (96, 64), jitter=(0.4, -0.3))[0]
-    _, expected = METHODS["bilinear"].step(None, METHODS["bilinear"].init(frame), frame)
+    _, expected = step(METHODS["bilinear"])(None, METHODS["bilinear"].init(frame), frame)
     errors = []
-    for follow_jitter in (True, False):
-        method = method_of("rrn", follow_jitter=follow_jitter)
+    for unjitter in (True, False):
+        method = method_of("rrn", unjitter=unjitter)
         zeros = jax.tree.map(jnp.zeros_like, state_of("rrn"))
-        _, image = jax.jit(method.step)(zeros, method.init(frame), frame)
+        _, image = jax.jit(step(method))(zeros, method.init(frame), frame)
         errors.append(float(jnp.mean(jnp.abs(to_display(image) - to_display(expected)))))
     assert errors[0] < 0.02
     assert errors[0] < 0.5 * errors[1]
@@ -147,7 +148,7 @@ def test_two_runs_are_equal_to_the_bit(name):
 @pytest.mark.parametrize("name", NAMES)
 def test_streaming_equals_scan(name):
     frames = clip()
-    scan = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(method_of(name).step, net), s, fs))
+    scan = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(step(method_of(name)), net), s, fs))
     _, images = scan(state_of(name), method_of(name).init(frames[0]), batched(*frames))
     np.testing.assert_allclose(np.stack(streamed(name)), images, rtol=2e-4, atol=2e-4)
 
@@ -157,7 +158,7 @@ def test_jit_equals_eager(name):
     frames, state = clip(), method_of(name).init(clip()[0])
     with jax.disable_jit():
         for frame, expected in zip(frames[:2], streamed(name), strict=False):
-            state, image = method_of(name).step(state_of(name), state, frame)
+            state, image = step(method_of(name))(state_of(name), state, frame)
             np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
 
 
@@ -208,7 +209,7 @@ def test_the_unit_of_radiance_does_not_matter(name, unit):
 @pytest.mark.parametrize("name", NAMES)
 def test_full_size_frames_pass_unchanged(name):
     frame, truth = frame_at(0, scale=1, jitter=(0.0, 0.0))
-    _, image = jax.jit(method_of(name).step)(state_of(name), method_of(name).init(frame), frame)
+    _, image = jax.jit(step(method_of(name)))(state_of(name), method_of(name).init(frame), frame)
     np.testing.assert_array_equal(image, frame.color_linear)
     np.testing.assert_allclose(image, truth, rtol=1e-6)
 
@@ -217,7 +218,7 @@ def test_full_size_frames_pass_unchanged(name):
 @pytest.mark.parametrize("size", [(2, 2), (10, 14)])
 def test_tiny_frames(name, size):
     frame, _ = frame_at(0, size)
-    _, image = jax.jit(method_of(name).step)(state_of(name), method_of(name).init(frame), frame)
+    _, image = jax.jit(step(method_of(name)))(state_of(name), method_of(name).init(frame), frame)
     assert image.shape == (*size[::-1], 3)
     assert np.isfinite(image).all()
 
@@ -225,7 +226,7 @@ def test_tiny_frames(name, size):
 @pytest.mark.parametrize("name", NAMES)
 def test_it_sees_colour_and_motion_alone(name):
     method, frame = method_of(name), frame_at(0)[0]
-    assert method.needs == {"lr.color", "hr.motion"}
+    assert method.needs.of(True) == {"lr.color", "hr.motion"}
 
     def bare(gbuffer):
         absent = dict.fromkeys(("normal", "base_color", "roughness", "metallic", "object_id"))
@@ -243,8 +244,8 @@ def test_frames_of_another_scale_are_named(name):
     frame, truth = frame_at(0, (24, 16), 4)
     message = "made for another scale; expected frames of scale 2; found scale 4; choose other weights"
     with pytest.raises(JaxsrError, match=message):
-        method_of(name).step(state_of(name), method_of(name).init(frame), frame)
-    net = drawn(lambda rngs: method_of(name).new_net(rngs))
+        step(method_of(name))(state_of(name), method_of(name).init(frame), frame)
+    net = drawn(lambda rngs: method_of(name).network.new(rngs))
     with pytest.raises(JaxsrError, match=message):
         method_of(name).loss(net, window([(frame, truth)] * 3))
 
@@ -264,7 +265,7 @@ def test_rrn_remembers():
 def test_rrn_feeds_back_what_it_made():
     """Two steps of the network itself: the first frame precedes itself, its output comes back as it was."""
     method, frames = method_of("rrn"), clip()[:2]
-    graph = nnx.graphdef(nnx.eval_shape(lambda: method.new_net(nnx.Rngs(0))))
+    graph = nnx.graphdef(nnx.eval_shape(lambda: method.network.new(nnx.Rngs(0))))
     net = nnx.merge(graph, state_of("rrn"))
     colors = [to_display(f.color_linear, f.exposure)[None] for f in frames]
     zero = jnp.zeros((1, *colors[0].shape[1:3], 8)), jnp.zeros((1, *SIZE[::-1], 3))
@@ -299,7 +300,7 @@ def test_a_broken_pixel_is_forgotten():
 @pytest.mark.parametrize("cut", [False, True])
 def test_rrn_s_loss_is_over_every_frame_from_an_empty_past(cut):
     """As streaming makes them, whether or not the first frame of the window has a past that it leaves out."""
-    net = drawn(lambda rngs: method_of("rrn").new_net(rngs))
+    net = drawn(lambda rngs: method_of("rrn").network.new(rngs))
     seen = [frame_at(t) for t in range(3)]
     total, parts = method_of("rrn").loss(net, window(seen, cut))
     pairs = zip(streamed("rrn"), seen, strict=False)
@@ -307,7 +308,7 @@ def test_rrn_s_loss_is_over_every_frame_from_an_empty_past(cut):
     # Streaming clips to [0, 1], which the random network leaves.
     assert float(total) == float(parts["l1"])
     assert np.mean(errors) <= float(total) < 3 * np.mean(errors)
-    made, past = [], rrn.beginning(batched(seen[0][0]), rrn.Options(scale=2, **SMALL["rrn"]))
+    made, past = [], rrn.first_past(batched(seen[0][0]), rrn.Options(scale=2, **SMALL["rrn"]))
     for frame, _ in seen:
         past, image = rrn.displayed(net, past, batched(frame), rrn.Options(scale=2, **SMALL["rrn"]))
         made.append(np.abs(image[0] - to_display(seen[len(made)][1])).mean())
@@ -315,7 +316,7 @@ def test_rrn_s_loss_is_over_every_frame_from_an_empty_past(cut):
 
 
 def test_rcan_s_loss_is_that_of_the_last_frame():
-    net = drawn(lambda rngs: method_of("rcan").new_net(rngs))
+    net = drawn(lambda rngs: method_of("rcan").network.new(rngs))
     (_, wrong), (frame, truth) = frame_at(1), frame_at(2)
     frame = frame._replace(exposure=jnp.asarray(0.5))
     total, parts = method_of("rcan").loss(net, window([(frame_at(1)[0], wrong), (frame, truth)]))
@@ -328,8 +329,8 @@ def test_rcan_s_loss_is_that_of_the_last_frame():
 def test_it_learns_one_window(name):
     """From where training begins, not where `drawn` does: RRN's tame weights take a hundred steps to wake."""
     method = build(name, SMALL[name] | {"scale": 2, "features": 16})
-    graph, params = nnx.split(method.new_net(nnx.Rngs(0)))
-    optimizer, seen = optax.adam(1e-3), window([frame_at(t) for t in range(method.window)])
+    graph, params = nnx.split(method.network.new(nnx.Rngs(0)))
+    optimizer, seen = optax.adam(1e-3), window([frame_at(t) for t in range(method.network.windows.length)])
 
     @jax.jit
     def step(params, opt):
@@ -353,7 +354,7 @@ def test_it_learns_one_window(name):
 @pytest.mark.parametrize("factor", [0.0, 1e6])
 def test_gradients_are_finite_in_the_dark_and_in_the_sun(name, factor):
     method = method_of(name)
-    graph, params = nnx.split(drawn(lambda rngs: method.new_net(rngs)))
+    graph, params = nnx.split(drawn(lambda rngs: method.network.new(rngs)))
     pairs = [
         (f._replace(color_linear=factor * f.color_linear), factor * t) for f, t in map(frame_at, range(3))
     ]
@@ -367,7 +368,11 @@ def test_windows_leave_out_the_past(tmp_path):
     """Only where the sequence has a cut does the window have one; none crosses one."""
     make_sequence(tmp_path / "clip", frames=5)
     source = WindowSource(
-        [tmp_path / "clip"], scale=2, needs=method_of("rrn").needs, length=3, cache=tmp_path / "cache"
+        [tmp_path / "clip"],
+        scale=2,
+        needs=method_of("rrn").needs.of(True),
+        length=3,
+        cache=tmp_path / "cache",
     )
     cuts = np.stack([stack([source[i]]).frames.reset[0] for i in range(len(source))])
     np.testing.assert_array_equal(cuts, [[True, False, False], [False] * 3, [False] * 3])
@@ -378,14 +383,17 @@ def test_windows_leave_out_the_past(tmp_path):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_arguments_in_json_build_the_same_method(name):
-    method = method_of(name, compute="bfloat16", ssim_weight=0.5)
-    again = build(name, json.loads(json.dumps(dict(method.arguments))))
-    assert again.arguments == method.arguments
-    assert (again.needs, again.window) == (method.needs, method.window)
+    method = method_of(name, dtype="bfloat16", ssim_weight=0.5)
+    again = build(name, json.loads(json.dumps(dict(method.network.settings))))
+    assert again.network.settings == method.network.settings
+    assert (again.needs.of(True), again.network.windows.length) == (
+        method.needs.of(True),
+        method.network.windows.length,
+    )
 
 
 def test_they_are_among_the_methods():
-    assert METHODS["rcan"].arguments == build("rcan", {}).arguments
+    assert METHODS["rcan"].network.settings == build("rcan", {}).network.settings
     assert (METHODS["rcan"].window, METHODS["rrn"].window, method_of("rrn").window) == (1, 4, 3)
     for name in NAMES:
         options = LEARNED[name].options()
@@ -406,7 +414,7 @@ def test_they_are_among_the_methods():
         ("rrn", {"frames": 0}, "frames: bad frames; expected a whole number of at least 1; found 0"),
         ("rrn", {"features": "many"}, "features: bad features; expected a whole number; found many"),
         ("rcan", {"l1_weight": 0.0}, "a loss of nothing"),
-        ("rcan", {"compute": "float16"}, "compute"),
+        ("rcan", {"dtype": "float16"}, "dtype"),
     ],
 )
 def test_bad_options_are_named(name, arguments, match):

@@ -17,13 +17,15 @@ from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.methods import METHODS, build, fusion_sr, guided, guided_taau, taau
-from jaxsr.methods._network import middle
-from jaxsr.methods.fusion_sr import Options, displayed, normalized_depth, sample_offset
+from jaxsr.methods.base import step
+from jaxsr.methods.fusion_sr import Options, displayed
+from jaxsr.methods.image_loss import middle
 from jaxsr.nets import blocks as layers
 from jaxsr.ops import backward_warp, modulate, to_display, upsample, zero_upsample
+from jaxsr.ops.encoding import compress_lighting, expand_lighting, normalized_depth, sample_offset
 from tests.networks import drawn
 
-PAPER = {"color": "display", "start": "nothing", "follow_jitter": False}
+PAPER = {"demodulated": False, "base": "none", "unjitter": False}
 SIZE = (24, 16)
 
 VARIANTS = {
@@ -31,9 +33,9 @@ VARIANTS = {
     "paper": PAPER,
     "unet": {"architecture": "unet", "down_kernel": 2} | PAPER,
     "unet guided": {"architecture": "unet", "buffers": ("depth", "base_color")},
-    "concat display": {"fusion": "concat", "color": "display", "compute": "bfloat16"},
-    "add depth": {"fusion": "add", "buffers": ("depth",), "start": "nothing"},
-    "display depth": {"buffers": ("roughness", "depth"), "start": "nothing", "color": "display"},
+    "concat display": {"fusion": "concat", "demodulated": False, "dtype": "bfloat16"},
+    "add depth": {"fusion": "add", "buffers": ("depth",), "base": "none"},
+    "display depth": {"buffers": ("roughness", "depth"), "base": "none", "demodulated": False},
 }
 
 
@@ -44,16 +46,16 @@ def method_of(name):
 
 @functools.cache
 def state_of(name, seed=0):
-    return nnx.state(drawn(lambda rngs: method_of(name).new_net(rngs), seed))
+    return nnx.state(drawn(lambda rngs: method_of(name).network.new(rngs), seed))
 
 
 @functools.cache
 def step_of(name):
-    return jax.jit(method_of(name).step)
+    return jax.jit(step(method_of(name)))
 
 
 def model_of(name):
-    graph = nnx.graphdef(nnx.eval_shape(lambda: method_of(name).new_net(nnx.Rngs(0))))
+    graph = nnx.graphdef(nnx.eval_shape(lambda: method_of(name).network.new(nnx.Rngs(0))))
     model = nnx.merge(graph, state_of(name))
     model.eval()
     return model
@@ -128,12 +130,12 @@ def test_depths_beyond_the_range_and_skies():
 
 def test_lighting_is_compressed_and_expanded():
     lighting = jnp.array([0, 1e-6, 1e-3, 0.1, 1.0, 10.0, 400.0])
-    compressed = fusion_sr.compress_lighting(lighting)
+    compressed = compress_lighting(lighting)
     assert (np.diff(compressed) > 0).all()
     assert (compressed < 1).all()
-    np.testing.assert_allclose(fusion_sr.expand_lighting(compressed), lighting, rtol=2e-4, atol=1e-7)
-    np.testing.assert_allclose(fusion_sr.expand_lighting(jnp.array([1.0, 7.0])), 499.25, rtol=1e-4)
-    for function in (fusion_sr.compress_lighting, fusion_sr.expand_lighting):
+    np.testing.assert_allclose(expand_lighting(compressed), lighting, rtol=2e-4, atol=1e-7)
+    np.testing.assert_allclose(expand_lighting(jnp.array([1.0, 7.0])), 499.25, rtol=1e-4)
+    for function in (compress_lighting, expand_lighting):
         slope = jax.vmap(jax.grad(function))(jnp.array([0.0, 0.5, 0.9995, 1.0, 3.0]))
         assert np.isfinite(slope).all()
 
@@ -142,7 +144,7 @@ def test_lighting_is_compressed_and_expanded():
 @pytest.mark.parametrize("exposure", [0.25, 3.0])
 def test_a_network_that_passes_colour_on_gives_the_colour(color, exposure):
     """What the network sees is turned back into scene-linear colour by the inverse of the same map."""
-    options = Options(color=color, start="nothing")
+    options = Options(color=color, base="none")
     frame, _ = frame_at(0)
     enlarged = functools.partial(upsample, scale=2, mode="nearest")
     flat = [jnp.asarray(np.random.default_rng(s).random((8, 12, 3), np.float32)) for s in (0, 1)]
@@ -165,7 +167,7 @@ def test_the_inputs_are_those_of_exposed_colour(options):
     frame, _ = frame_at(0)
     unit = 1e4  # of radiance, as in candela a square metre
     other = frame._replace(color_linear=frame.color_linear * unit, exposure=frame.exposure / unit)
-    for function in (fusion_sr.color_input, fusion_sr.starting_point)[: 1 + (options.start == "guided")]:
+    for function in (fusion_sr.color_input, fusion_sr.base_image)[: 1 + (options.base == "guided")]:
         first, second = (function(f, options) for f in (frame, other))
         np.testing.assert_allclose(first, second, atol=1e-4)
         assert (np.asarray(first) >= 0).all()
@@ -233,8 +235,8 @@ def test_the_network_is_told_the_offset():
         return jnp.zeros((*gbuffer.shape[:-1], 3))
 
     frames = batched(*(frame_at(t, scale=4)[0] for t in range(2)))
-    displayed(net, frames, Options(start="nothing"))
-    displayed(net, frames, Options(start="nothing", follow_jitter=False))
+    displayed(net, frames, Options(base="none"))
+    displayed(net, frames, Options(base="none", unjitter=False))
     np.testing.assert_array_equal(seen[0], [[3, 0], [2, 0]])
     assert seen[1] is None
 
@@ -244,7 +246,7 @@ def test_the_network_is_told_the_offset():
 
 def test_streaming_equals_scan():
     frames = clip()
-    run = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(method_of("default").step, net), s, fs))
+    run = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(step(method_of("default")), net), s, fs))
     _, images = run(state_of("default"), method_of("default").init(frames[0]), batched(*frames))
     np.testing.assert_allclose(np.stack(streamed()), images, rtol=2e-4, atol=2e-4)
 
@@ -252,7 +254,7 @@ def test_streaming_equals_scan():
 def test_jit_equals_eager():
     frame = clip()[0]
     with jax.disable_jit():
-        _, image = method_of("default").step(state_of("default"), method_of("default").init(frame), frame)
+        _, image = step(method_of("default"))(state_of("default"), method_of("default").init(frame), frame)
     np.testing.assert_allclose(image, streamed()[0], rtol=1e-3, atol=1e-4)
 
 
@@ -266,7 +268,7 @@ def test_an_extrapolated_frame_never_sees_its_colour():
 def test_it_extrapolates_by_guided_reprojection_of_its_output():
     frames = clip()
     history = taau.State(streamed()[0], jnp.ones((*SIZE[::-1], 1)), frames[0].hr.depth_linear)
-    state = guided.State(history, *guided.surface(frames[0].hr))
+    state = guided.State(history, *guided.surface_of(frames[0].hr))
     _, expected = guided.extrapolate(guided.Options(), state, frames[1])
     np.testing.assert_allclose(streamed()[1], expected, rtol=1e-4, atol=1e-5)
 
@@ -291,7 +293,7 @@ def test_rendered_frames_need_no_history():
 def test_full_size_frames_pass_unchanged():
     frame, truth = frame_at(0, scale=1, jitter=(0.0, 0.0))
     method = method_of("default")
-    _, image = jax.jit(method.step)(state_of("default"), method.init(frame), frame)
+    _, image = jax.jit(step(method))(state_of("default"), method.init(frame), frame)
     np.testing.assert_array_equal(image, frame.color_linear)
     np.testing.assert_allclose(image, truth, rtol=1e-6)
 
@@ -307,7 +309,7 @@ def test_the_smallest_frame():
 def test_any_size_and_scale(size, scale):
     frame, _ = frame_at(0, size, scale)
     method = method_of("default")
-    _, image = jax.eval_shape(method.step, state_of("default"), method.init(frame), frame)
+    _, image = jax.eval_shape(step(method), state_of("default"), method.init(frame), frame)
     assert image.shape == (*size[::-1], 3)
 
 
@@ -318,12 +320,12 @@ def test_variants_see_only_what_they_need(name):
     for place in ("lr", "hr"):
         gbuffer = getattr(frame, place)
         names = ("normal", "base_color", "roughness", "metallic", "object_id")
-        absent = {k: None for k in names if f"{place}.{k}" not in method.needs}
+        absent = {k: None for k in names if f"{place}.{k}" not in method.needs.of(True)}
         frame = frame._replace(**{place: gbuffer._replace(**absent)})
-    _, image = jax.eval_shape(method.step, state_of(name), method.init(frame), frame)
+    _, image = jax.eval_shape(step(method), state_of(name), method.init(frame), frame)
     assert image.shape == (*SIZE[::-1], 3)
     assert image.dtype == jnp.float32
-    assert {"lr.color", "hr.motion"} <= method.needs
+    assert {"lr.color", "hr.motion"} <= method.needs.of(True)
 
 
 @pytest.mark.parametrize("name", ["unet", "concat display"])
@@ -337,12 +339,12 @@ def test_variants_run(name):
 @pytest.mark.parametrize("name", VARIANTS)
 def test_arguments_in_json_build_the_same_method(name):
     method = method_of(name)
-    again = build("fusion-sr", json.loads(json.dumps(dict(method.arguments))))
-    assert again.arguments == method.arguments
-    assert again.needs == method.needs
-    assert Options(**again.arguments) == Options(**VARIANTS[name])
+    again = build("fusion-sr", json.loads(json.dumps(dict(method.network.settings))))
+    assert again.network.settings == method.network.settings
+    assert again.needs.of(True) == method.needs.of(True)
+    assert Options(**again.network.settings) == Options(**VARIANTS[name])
     shapes = [
-        jax.tree.map(jnp.shape, nnx.state(nnx.eval_shape(lambda m=m: m.new_net(nnx.Rngs(0)))))
+        jax.tree.map(jnp.shape, nnx.state(nnx.eval_shape(lambda m=m: m.network.new(nnx.Rngs(0)))))
         for m in (method, again)
     ]
     assert shapes[0] == shapes[1]
@@ -351,9 +353,9 @@ def test_arguments_in_json_build_the_same_method(name):
 @pytest.mark.parametrize(("architecture", "count"), [("fusion", 418_619), ("unet", 506_907)])
 def test_the_paper_s_form_has_the_paper_s_size(architecture, count):
     method = build("fusion-sr", PAPER | {"architecture": architecture})
-    net = nnx.eval_shape(lambda: method.new_net(nnx.Rngs(0)))
+    net = nnx.eval_shape(lambda: method.network.new(nnx.Rngs(0)))
     assert sum(p.size for p in jax.tree.leaves(nnx.state(net, nnx.Param))) == count
-    assert method.needs == {"lr.color", "hr.motion"} | {f"hr.{k}" for k in fusion_sr.BUFFERS}
+    assert method.needs.of(True) == {"lr.color", "hr.motion"} | {f"hr.{k}" for k in fusion_sr.BUFFERS}
 
 
 @pytest.mark.parametrize(
@@ -370,10 +372,10 @@ def test_the_paper_s_form_has_the_paper_s_size(architecture, count):
         ({"fusion": "product"}, "fusion"),
         ({"architecture": "gan"}, "architecture"),
         ({"down_kernel": 4}, "down_kernel"),
-        ({"compute": "float16"}, "compute"),
+        ({"dtype": "float16"}, "dtype"),
         ({"buffers": 5}, "buffers: bad buffers; expected a list of names; found 5"),
         ({"buffers": [1, 2]}, "buffers"),
-        ({"follow_jitter": "no"}, "follow_jitter: bad follow_jitter; expected true or false; found no"),
+        ({"unjitter": "no"}, "unjitter: bad unjitter; expected true or false; found no"),
         ({"perceptual_crop": "x"}, "perceptual_crop"),
         ({"perceptual_crop": 15}, "perceptual_crop: bad perceptual_crop; expected at least 16, which LPIPS"),
         ({"l1_weight": None}, "l1_weight"),
@@ -395,7 +397,7 @@ def test_arguments_of_another_version_are_named():
 
 
 def test_it_is_among_the_methods():
-    assert METHODS["fusion-sr"].arguments == method_of("default").arguments
+    assert METHODS["fusion-sr"].network.settings == method_of("default").network.settings
     assert METHODS["fusion-sr"].window == 1
 
 
@@ -406,7 +408,7 @@ def test_untrained_it_is_the_guided_upsampling(monkeypatch):
         return jnp.asarray(draw.normal(0, 0.1, shape), dtype)
 
     monkeypatch.setattr(layers, "XAVIER", numpy_init)  # JAX's own compiles for every shape
-    net = nnx.state(method_of("default").new_net(nnx.Rngs(0)))
+    net = nnx.state(method_of("default").network.new(nnx.Rngs(0)))
     for t in range(2):
         frame = frame_at(t)[0]._replace(exposure=jnp.asarray(1.5))
         _, image = step_of("default")(net, method_of("default").init(frame), frame)
@@ -426,7 +428,7 @@ def test_training_and_inference_make_the_same_picture(name):
     shown, linear = run(net, batched(*frames))
     for i, frame in enumerate(frames):
         _, image = step_of(name)(state_of(name), method_of(name).init(frame), frame)
-        tolerance = 0.02 if options.compute == "bfloat16" else 1e-4
+        tolerance = 0.02 if options.dtype == "bfloat16" else 1e-4
         np.testing.assert_allclose(linear[i], image, rtol=tolerance, atol=tolerance)
         np.testing.assert_allclose(
             jnp.clip(shown[i], 0, 1), to_display(image, frame.exposure), atol=max(tolerance, 2e-4)
@@ -446,7 +448,7 @@ def training(name):
     """Parameters, the rest, and one compiled update."""
     options = VARIANTS[name] | {"perceptual_weight": 0.0, "l1_weight": 1.0}
     method = build("fusion-sr", options)
-    net = drawn(lambda rngs: method.new_net(rngs))
+    net = drawn(lambda rngs: method.network.new(rngs))
     last = net.decoder1.convs.conv2
     if options.get("start") != "nothing":
         last.kernel[...], last.bias[...] = 0.1 * last.kernel[...], jnp.full_like(last.bias[...], 0.5)
@@ -470,12 +472,12 @@ def training(name):
 
 def test_residuals_may_begin_at_zero():
     def scales(**options):
-        net = fusion_sr.method(fusion_sr.Options(**options)).new_net(nnx.Rngs(0))
+        net = fusion_sr.method(fusion_sr.Options(**options)).network.new(nnx.Rngs(0))
         return [float(jnp.max(jnp.abs(fusion.norm2.scale[...]))) for fusion in net.fusions]
 
     assert scales() == [1, 1, 1]
     assert scales(residual="zero") == [0, 0, 0]
-    fusion_sr.method(fusion_sr.Options(residual="zero", fusion="concat")).new_net(nnx.Rngs(0))  # has none
+    fusion_sr.method(fusion_sr.Options(residual="zero", fusion="concat")).network.new(nnx.Rngs(0))  # has none
 
 
 def test_the_loss_falls_on_one_window():
@@ -531,8 +533,8 @@ def test_the_loss_is_its_parts_on_displayed_colour(monkeypatch):
         seen.append((pred, target))
         return jnp.mean(jnp.abs(pred - target))
 
-    monkeypatch.setattr("jaxsr.methods._network.lpips", fake)
-    options = Options(start="nothing", color="display", perceptual_crop=12, l1_weight=0.5)
+    monkeypatch.setattr("jaxsr.methods.image_loss.lpips", fake)
+    options = Options(base="none", demodulated=False, perceptual_crop=12, l1_weight=0.5)
     (frame, truth), (other, wrong) = frame_at(0), frame_at(1)
     frame = frame._replace(exposure=jnp.asarray(0.5))
     frames = jax.tree.map(lambda a, b: jnp.stack([a, b])[None], other, frame)

@@ -11,11 +11,12 @@ from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame
 from jaxsr.methods import METHODS, taau
+from jaxsr.methods.base import step
 from jaxsr.ops import jitter_sequence, to_display
 from jaxsr.runtime.stream import stream
 
 SIZE = (96, 54)
-NAMES = sorted(name for name, method in METHODS.items() if method.new_net is None)
+NAMES = sorted(name for name, method in METHODS.items() if method.network.new is None)
 """Those that learn nothing; tests/test_fusion_sr.py has the others."""
 
 
@@ -60,7 +61,7 @@ def test_streaming_equals_scan(name):
     frames, _ = clip(2, 4, 2)
     method = METHODS[name]
     state = method.init(jax.tree.map(jnp.asarray, frames[0]))
-    _, images = jax.jit(lambda s, fs: jax.lax.scan(functools.partial(method.step, None), s, fs))(
+    _, images = jax.jit(lambda s, fs: jax.lax.scan(functools.partial(step(method), None), s, fs))(
         state, stacked(frames)
     )
     np.testing.assert_allclose(np.stack(outputs(name, 2, 4, 2)), images, rtol=2e-4, atol=2e-4)
@@ -73,7 +74,7 @@ def test_jit_equals_eager(name):
     with jax.disable_jit():
         state = method.init(jax.tree.map(jnp.asarray, frames[0]))
         for frame, expected in zip(frames[:2], compiled, strict=False):
-            state, image = method.step(None, state, jax.tree.map(jnp.asarray, frame))
+            state, image = step(method)(None, state, jax.tree.map(jnp.asarray, frame))
             np.testing.assert_allclose(image, expected, rtol=1e-4, atol=1e-4)
 
 

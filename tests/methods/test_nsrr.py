@@ -17,11 +17,12 @@ from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.methods import METHODS, build, nsrr
-from jaxsr.methods.fusion_sr import normalized_depth
+from jaxsr.methods.base import step
 from jaxsr.methods.nsrr import Options
 from jaxsr.nets import NSRR
 from jaxsr.nets.nsrr import CHANNELS
 from jaxsr.ops import backward_warp, compose_motion, to_display, warp_zero_upsampled, world_position
+from jaxsr.ops.encoding import normalized_depth
 from jaxsr.runtime.load import find_method
 from tests.builders import make_sequence
 from tests.networks import drawn
@@ -31,7 +32,7 @@ from tests.test_cli import error_line, run
 
 SIZE = (24, 16)
 
-VARIANTS = {"default": {}, "two": {"previous": 2}, "half": {"previous": 1, "compute": "bfloat16"}}
+VARIANTS = {"default": {}, "two": {"previous": 2}, "half": {"previous": 1, "dtype": "bfloat16"}}
 
 
 # The network.
@@ -92,7 +93,7 @@ def test_the_network_is_the_loops():
 
     @jax.jit
     def made(rgbd, motion):
-        before = compose_motion(motion[0], nsrr.longer(motion[1]))
+        before = compose_motion(motion[0], nsrr.with_own_path(motion[1]))
         places = jnp.array(offsets, jnp.int32)
         steps = jnp.moveaxis(before.reshape(*before.shape[:2], 2, 2), 2, 0)
         from_before = warp_zero_upsampled(net.previous_features(rgbd[1:]), steps, scale, places[1:])
@@ -204,16 +205,16 @@ def method_of(name):
 
 @functools.cache
 def state_of(name, seed=0):
-    return nnx.state(drawn(lambda rngs: method_of(name).new_net(rngs), seed))
+    return nnx.state(drawn(lambda rngs: method_of(name).network.new(rngs), seed))
 
 
 @functools.cache
 def step_of(name):
-    return jax.jit(method_of(name).step)
+    return jax.jit(step(method_of(name)))
 
 
 def model_of(name):
-    graph = nnx.graphdef(nnx.eval_shape(lambda: method_of(name).new_net(nnx.Rngs(0))))
+    graph = nnx.graphdef(nnx.eval_shape(lambda: method_of(name).network.new(nnx.Rngs(0))))
     return nnx.merge(graph, state_of(name))
 
 
@@ -256,7 +257,7 @@ def test_a_window_is_what_streaming_has_seen():
     @jax.jit
     def seen(net, window, now):
         model = nnx.merge(graph, net)
-        history = nsrr.history_of(model, window)
+        history = nsrr.previous_of(model, window)
         return history, nsrr.displayed(model, now, history)
 
     history, shown = seen(net, jax.tree.map(lambda x: x[None], batched(*frames)), now)
@@ -281,7 +282,7 @@ def test_the_history_lies_where_the_scene_does():
         frames[-1] = jax.tree.map(jnp.asarray, frames[-1])
     path = jnp.zeros((64, 96, 0))
     for frame in frames[1:]:
-        path = compose_motion(frame.hr.motion_px, nsrr.longer(path))
+        path = compose_motion(frame.hr.motion_px, nsrr.with_own_path(path))
     ids, now = np.asarray(frames[4].hr.object_id), frames[4].hr
     pixel, positions = 2 * 0.62 / size[0], world_position(now.depth_linear, frames[4].camera)
     for k in range(1, 5):
@@ -345,7 +346,7 @@ def test_the_state_keeps_its_size(name):
     assert state.history.features.shape == (n, 8, 12, CHANNELS)
     for rendered in (True, False):
         frame, _ = frame_at(1, rendered=rendered)
-        after, _ = jax.eval_shape(method_of(name).step, state_of(name), state, frame)
+        after, _ = jax.eval_shape(step(method_of(name)), state_of(name), state, frame)
         assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == shapes
 
 
@@ -382,7 +383,7 @@ def test_the_input():
 
 def test_streaming_equals_scan():
     frames = clip(4, unrendered=(2,))
-    run = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(method_of("default").step, net), s, fs))
+    run = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(step(method_of("default")), net), s, fs))
     _, images = run(state_of("default"), method_of("default").init(frames[0]), batched(*frames))
     made = np.stack([image for _, image in stream("default", frames)])
     np.testing.assert_allclose(made, images, rtol=2e-4, atol=2e-4)
@@ -391,7 +392,7 @@ def test_streaming_equals_scan():
 def test_jit_equals_eager():
     frames = clip(2)
     with jax.disable_jit():
-        _, image = method_of("default").step(state_of("default"), streamed()[0][0], frames[1])
+        _, image = step(method_of("default"))(state_of("default"), streamed()[0][0], frames[1])
     np.testing.assert_allclose(image, streamed()[1][1], rtol=1e-3, atol=1e-4)
 
 
@@ -399,14 +400,14 @@ def test_jit_equals_eager():
 def test_any_size_and_scale(size, scale):
     frame, _ = frame_at(0, size, scale)
     method = method_of("default")
-    _, image = jax.eval_shape(method.step, state_of("default"), method.init(frame), frame)
+    _, image = jax.eval_shape(step(method), state_of("default"), method.init(frame), frame)
     assert image.shape == (*size[::-1], 3)
     assert image.dtype == jnp.float32
 
 
 @pytest.mark.parametrize(("size", "scale"), [((2, 2), 2), ((15, 9), 3)])
 def test_odd_frames_run(size, scale):
-    step = jax.jit(method_of("two").step)
+    step = jax.jit(step(method_of("two")))
     state = method_of("two").init(frame_at(0, size, scale)[0])
     for t in range(2):
         state, image = step(state_of("two"), state, frame_at(t, size, scale)[0])
@@ -425,7 +426,7 @@ def test_full_size_frames_pass_unchanged():
     frames = [frame_at(t, scale=1, rendered=t == 0)[0] for t in range(2)]
     state = method.init(frames[0])
     assert state.history.features.size == state.history.motion_px.size == 0
-    step = jax.jit(method.step)
+    step = jax.jit(step(method))
     state, image = step(state_of("default"), state, frames[0])
     np.testing.assert_array_equal(image, frames[0].color_linear)
     _, image = step(state_of("default"), state, frames[1])
@@ -437,20 +438,24 @@ def test_full_size_frames_pass_unchanged():
 @pytest.mark.parametrize("name", VARIANTS)
 def test_it_sees_only_what_it_needs(name):
     method, frame = method_of(name), frame_at(0)[0]
-    assert method.needs == {"lr.color", "lr.depth", "hr.motion"}
+    assert method.needs.of(True) == {"lr.color", "lr.depth", "hr.motion"}
     names = ("normal", "base_color", "roughness", "metallic", "object_id")
     bare = {place: getattr(frame, place)._replace(**dict.fromkeys(names)) for place in ("lr", "hr")}
     frame = frame._replace(**bare)
-    _, image = jax.eval_shape(method.step, state_of(name), method.init(frame), frame)
+    _, image = jax.eval_shape(step(method), state_of(name), method.init(frame), frame)
     assert image.shape == (*SIZE[::-1], 3)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_arguments_in_json_build_the_same_method(name):
     method = method_of(name)
-    again = build("nsrr", json.loads(json.dumps(dict(method.arguments))))
-    assert again.arguments == method.arguments
-    assert again.window == method.window == Options(**VARIANTS[name]).previous + 1
+    again = build("nsrr", json.loads(json.dumps(dict(method.network.settings))))
+    assert again.network.settings == method.network.settings
+    assert (
+        again.network.windows.length
+        == method.network.windows.length
+        == Options(**VARIANTS[name]).previous + 1
+    )
 
 
 @pytest.mark.parametrize(
@@ -458,7 +463,7 @@ def test_arguments_in_json_build_the_same_method(name):
     [
         ({"previous": 0}, "previous: bad previous; expected a whole number from 1; found 0"),
         ({"previous": 1.5}, "previous: bad previous; expected a whole number; found 1.5"),
-        ({"compute": "float16"}, "compute"),
+        ({"dtype": "float16"}, "dtype"),
         ({"perceptual_weight": -1.0}, "perceptual_weight"),
     ],
 )
@@ -488,7 +493,7 @@ def window(frames, truths):
 def training():
     """Parameters, and one compiled update; with two previous frames."""
     method = build("nsrr", VARIANTS["two"] | {"perceptual_weight": 0.0, "l1_weight": 1.0})
-    graph, params = nnx.split(drawn(lambda rngs: method.new_net(rngs)))
+    graph, params = nnx.split(drawn(lambda rngs: method.network.new(rngs)))
     optimizer = optax.adam(2e-3)
 
     @jax.jit

@@ -174,7 +174,12 @@ def test_two_devices_train_as_one(data, method):
     size, so that rounding decides where weights go whose gradient is nearly 0.
     """
     config = TrainConfig(batch=4, scale=2, crop=16, ema=0.9, clip_norm=1.0)
-    shared = {"scale": 2, "needs": method.needs, "window": method.window, "cache": data.parent / "cache"}
+    shared = {
+        "scale": 2,
+        "needs": method.needs.of(True),
+        "window": method.network.windows.length,
+        "cache": data.parent / "cache",
+    }
     loader = make_loader([data], batch=4, crop=16, **shared)
     batches = [next(loader) for _ in range(3)]
     loader.close()
@@ -267,7 +272,7 @@ def test_fine_tuning_at_another_scale(whole, data, tmp_path):
 
 def test_weights_of_other_options_are_noted(data, tmp_path, capsys):
     """Shapes can fit where the meaning does not."""
-    old = tiny_method.method()._replace(arguments={"color": "display", "buffers": ["depth"], "gone": 1})
+    old = tiny_method.method()._replace(arguments={"demodulated": False, "buffers": ["depth"], "gone": 1})
     new = old._replace(arguments={"color": "lighting", "buffers": ("depth",)})
     config = TrainConfig(data=(data,), out=tmp_path / "old", cache=data.parent / "cache", scale=2, crop=16)
     config = dataclasses.replace(config, steps=1, batch=2)
@@ -292,7 +297,12 @@ def test_the_sample_is_the_default(tmp_path):
 
 
 def test_the_last_frame_is_held_back(data, whole):
-    shared = {"scale": 2, "held_back": 1, "cache": data.parent / "cache", "needs": tiny_method.method().needs}
+    shared = {
+        "scale": 2,
+        "held_back": 1,
+        "cache": data.parent / "cache",
+        "needs": tiny_method.method().needs.of(True),
+    }
     loader = make_loader([data], crop=16, **shared)
     loader.close()
     assert loader.windows == 4
@@ -315,7 +325,13 @@ def test_a_window_is_history(data):
     method = tiny_method.method(window=3)._replace(
         init=lambda frame: jnp.where(frame.reset, jnp.int32(0), jnp.int32(-1)), step=step
     )
-    shared = {"scale": 2, "held_back": 1, "cache": data.parent / "cache", "needs": method.needs, "window": 3}
+    shared = {
+        "scale": 2,
+        "held_back": 1,
+        "cache": data.parent / "cache",
+        "needs": method.needs.of(True),
+        "window": 3,
+    }
     found = loop.Evaluator(method, [data / "clip"], **shared)(None)
     jax.effects_barrier()
     assert seen == [(True, 0), (False, 1), (False, 2)]

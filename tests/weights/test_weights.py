@@ -216,17 +216,17 @@ def test_the_header_of_published_weights_builds_their_network(tmp_path, make, ar
     assert header == json.loads(json.dumps(told))
     assert (header["method"], header["scale"], header["jaxsr"]) == ("fusion-sr", 2, jaxsr.__version__)
     assert header["source"]["file"] == "a.npz"
-    assert {k: header["arguments"][k] for k in ("color", "start", "follow_jitter")} == {
-        "color": "display",
-        "start": "nothing",
-        "follow_jitter": False,
+    assert {k: header["arguments"][k] for k in ("color", "start", "unjitter")} == {
+        "demodulated": False,
+        "base": "none",
+        "unjitter": False,
     }
     method = build(header["method"], header["arguments"])
-    net = nnx.eval_shape(lambda: method.new_net(nnx.Rngs(0)))
+    net = nnx.eval_shape(lambda: method.network.new(nnx.Rngs(0)))
     assert isinstance(net, make)
     into(nnx.state(net), arrays, out)
     for key, value in arguments.items():
-        assert method.arguments[key] == value
+        assert method.network.settings[key] == value
 
 
 @pytest.mark.parametrize(
@@ -252,7 +252,9 @@ def test_names_and_shapes_of_published_weights_tell_all(tmp_path, capsys, make, 
         arguments["scale"],
     )
     into(nnx.state(abstract(make, **arguments)), arrays, out)
-    assert find_method(str(out), arguments["scale"]).method.arguments["features"] == arguments["features"]
+    assert (
+        find_method(str(out), arguments["scale"]).method.network.settings["features"] == arguments["features"]
+    )
     line = error_line(capsys, "convert-weights", source, out, "--scale", 7)
     assert f"a.npz: the weights are of another scale; expected 7; found {arguments['scale']}" in line
     line = error_line(capsys, "convert-weights", source, out, "--buffers", "depth")
@@ -307,7 +309,7 @@ def converted(source, out):
     """Our network with published weights, by way of `jaxsr convert-weights`: compiled, and its state."""
     convert_published(source, out)
     arrays, header = load_weights(out)
-    new_net = build(header["method"], header["arguments"]).new_net
+    new_net = build(header["method"], header["arguments"]).network.new
     graph, state = nnx.split(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))))
     net = nnx.merge(graph, into(state, arrays, out))
     net.eval()

@@ -1,8 +1,8 @@
-"""What methods share whose network sees nothing but colour: display-referred images, one scale, the jitter.
+"""What networks share that see nothing but colour: display-referred images, one scale, the jitter.
 
     I_J = sRGB(ACES(exposure I))       colour of the jittered LR frame, in [0, 1]         `color_input`
     O_J = net(I_J, ...)                the network knows of no jitter: jittered as I_J is
-    O_N(p) = O_J(p - s J)              equation 1 of `jaxsr.ops.jitter`, in HR pixels     `shown`
+    O_N(p) = O_J(p - s J)              equation 1 of `jaxsr.ops.jitter`, in HR pixels     `unjittered`
 
 The loss compares O_N with the truth, so the network is trained through that shift. Scene-linear colour is
 O_N clipped to [0, 1] and turned back, at most 7.24 / exposure: such networks know no brighter lights.
@@ -17,32 +17,25 @@ from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame
-from jaxsr.methods._network import ImageLoss
 from jaxsr.ops import from_display, to_display
 from jaxsr.ops.resampling import kernel_taps
 
 
 @dataclass(frozen=True)
-class ColorOptions(ImageLoss):
-    """Options of such methods: the published loss is L1 alone."""
+class ColorOptions:
+    """Settings of such methods."""
 
-    ssim_weight: float = 0.0
-    """Of 1 - SSIM."""
-    l1_weight: float = 1.0
-    """Of the mean absolute error."""
-    perceptual_weight: float = 0.0
-    """Of LPIPS; 0 needs no LPIPS weights."""
     scale: int = 4
     """HR size over LR size, which the layers depend on; `jaxsr train` takes that of the training."""
-    follow_jitter: bool = True
+    unjitter: bool = True
     """Take the jitter out of what the network makes."""
-    compute: Literal["float32", "bfloat16"] = "float32"
+    dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the convolutions; parameters and losses are float32."""
 
 
 def color_input(frames: Frame) -> Float[Array, "*b h w 3"]:
     """I_J of one frame, or of many."""
-    return to_display(frames.color_linear * frames.exposure[..., None, None, None])
+    return to_display(frames.exposed)
 
 
 def check_scale(frames: Frame, options: ColorOptions) -> None:
@@ -56,18 +49,19 @@ def check_scale(frames: Frame, options: ColorOptions) -> None:
         )
 
 
-def shown(
-    made: Float[Array, "b H W 3"], jitter_px: Float[Array, "b 2"], options: ColorOptions
+def unjittered(
+    output: Float[Array, "b H W 3"], jitter_px: Float[Array, "b 2"], options: ColorOptions
 ) -> Float[Array, "b H W 3"]:
     """O_N, not clipped.
 
     Args:
-        made: O_J.
+        output: O_J.
         jitter_px: J in LR pixels.
+        options: of the method.
     """
-    if not options.follow_jitter:
-        return made
-    return without_jitter(made, options.scale * jitter_px, -(-options.scale // 2))
+    if not options.unjitter:
+        return output
+    return without_jitter(output, options.scale * jitter_px, -(-options.scale // 2))
 
 
 def without_jitter(
@@ -75,8 +69,8 @@ def without_jitter(
 ) -> Float[Array, "b H W c"]:
     """`sample_jittered(image, jitter_px, (H, W), "bicubic")`, for jitters of at most `reach` pixels.
 
-    All pixels of an image move alike, so it is a sum of shifted images along each axis: to gather them would
-    take longer, and the gradient of a gather longer still.
+    All pixels of an image move by the same amount. So the result is a sum of shifted images along each axis,
+    which is faster than a gather, and its gradient much faster than a scatter.
     """
     for axis, shift in ((1, -jitter_px[:, 1]), (2, -jitter_px[:, 0])):
         base = jnp.floor(shift)
@@ -96,5 +90,5 @@ def without_jitter(
 
 
 def to_linear(display: Float[Array, "*b H W 3"], exposure: Float[Array, "*b"]) -> Float[Array, "*b H W 3"]:
-    """Scene-linear colour of O_N."""
+    """Scene-linear colour of display-referred colour, clipped to [0, 1]."""
     return from_display(jnp.clip(display, 0, 1)) / exposure[..., None, None, None]
