@@ -29,7 +29,8 @@ from flax import nnx
 from benchmarks import _common
 from benchmarks._common import Inputs, Prepared, Variant
 from jaxsr.frames import Camera, Frame, GBuffer, Scale, Window
-from jaxsr.methods import Method, fusion_sr
+from jaxsr.methods import METHODS, Method, Network, fusion_sr
+from jaxsr.methods.image_loss import ImageLoss
 from jaxsr.nets import FusionSR
 from jaxsr.nets import vgg as perceptual
 from jaxsr.training import TrainConfig
@@ -250,8 +251,8 @@ def ours_step(name: str, dtype: Any = jnp.float32) -> Variant:
         return jnp.mean(jnp.abs(net(batch.color, batch.gbuffer) - batch.truth)), {}
 
     def build(inputs: Inputs) -> Prepared:
-        bare = Method("", "", lambda _: (), lambda *_: ((), jnp.zeros(())), frozenset())  # type: ignore[arg-type]
-        method = bare._replace(new_net=lambda rngs: FusionSR(dtype=dtype, rngs=rngs), loss=loss)
+        net = Network(lambda rngs: FusionSR(dtype=dtype, rngs=rngs), loss)  # type: ignore[arg-type]
+        method = METHODS["fusion-sr"]._replace(network=net)  # its steps are not run
         return step_of(method, TrainConfig(batch=BATCH), images(inputs, BATCH))
 
     return Variant(name, build)
@@ -287,9 +288,9 @@ def window_of(inputs: Inputs) -> Window:
     return jax.tree.map(lambda x: np.asarray(x)[:, None], Window(frame, truth))
 
 
-def lpips_step(name: str, **options: Any) -> Variant:
+def lpips_step(name: str, **weights: Any) -> Variant:
     def build(inputs: Inputs) -> Prepared:
-        method = fusion_sr.method(fusion_sr.Options(**options))
+        method = fusion_sr.method(loss=ImageLoss(**weights))
         return step_of(method, TrainConfig(batch=BATCH), window_of(inputs))
 
     return Variant(name, build)

@@ -66,6 +66,7 @@ def train(data: Path, out: Path, **options):
 
 
 def main() -> None:
+    from jaxsr.progress import Bar
     from jaxsr.training import loop
 
     data, out, *when = sys.argv[1:]
@@ -85,7 +86,7 @@ def main() -> None:
         setattr(owner, name, wrapped)
 
     if moment == "--step":
-        before(loop.Bar, "update", lambda arguments: arguments[1])
+        before(Bar, "update", lambda arguments: arguments[1] if arguments[0]._title == "steps" else None)
     if moment == "--picture":  # the weights are released, the checkpoint of the same step is not written
         before(loop.Log, "picture", lambda arguments: arguments[2])
     if moment == "--save":

@@ -1,11 +1,14 @@
 """Put trained networks into the package, with a model card each.
 
     python experiments/fusion_sr/release.py [NAME ...] [--runs DIR]
+    python experiments/fusion_sr/release.py --renew
 
 For each run of `train_released.py` that has ended: store its weights as float16 in
 `jaxsr/weights/released/NAME.safetensors`, measure that file and its rivals on the test frames of the
 sample, and write `docs/models/NAME.md` with data, budget, metrics and limits, and
 `experiments/results/NAME.json` with every number of every frame.
+
+`--renew` gives the files that ship the header that this version of jaxsr writes. Their arrays stay.
 """
 
 import json
@@ -29,10 +32,12 @@ from jaxsr.evaluation.demo import description  # noqa: E402
 from jaxsr.evaluation.evaluate import evaluate  # noqa: E402
 from jaxsr.evaluation.running import Settings  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
-from jaxsr.progress import bars  # noqa: E402
+from jaxsr.methods import build  # noqa: E402
+from jaxsr.progress import Bars  # noqa: E402
 from jaxsr.report.results import SequenceResult  # noqa: E402
 from jaxsr.report.tables import as_json, cell, header, summary  # noqa: E402
-from jaxsr.weights.file import load_weights, save_weights  # noqa: E402
+from jaxsr.runtime.load import settings_of  # noqa: E402
+from jaxsr.weights.file import load_weights, new_header, save_weights  # noqa: E402
 
 RIVALS = ("bicubic", "taau", "guided-taau")
 MAX_MEGABYTES = 2.0
@@ -43,13 +48,19 @@ RESULTS = ROOT / "experiments" / "results"
 def main(
     names: Positional[tuple[str, ...]] = (),
     runs: Path = ROOT / "experiments" / "cache" / "runs",
+    renew: bool = False,
 ) -> None:
     """Release these runs; all that have ended by default.
 
     Args:
         names: of the runs.
         runs: folder of the runs.
+        renew: only write the headers of the files that ship anew.
     """
+    if renew:
+        for name in chosen(names):
+            renew_header(WEIGHTS / f"{name}.safetensors")
+        return
     for name, run in chosen(names).items():
         file = runs / name / "weights.safetensors"
         if not names and not file.is_file():
@@ -72,9 +83,35 @@ def main(
         release(name, run, target, head)
 
 
+def renew_header(file: Path) -> None:
+    """Write all settings into the header of a file that an earlier version of jaxsr made; the arrays stay.
+
+    Raises:
+        JaxsrError: the file is damaged, or the arrays would change.
+    """
+    arrays, head = load_weights(file)
+    settings = settings_of(head, file)
+    network = build(head["method"], settings, file).network
+    assert network is not None  # `build` knows only methods that learn
+    training = dict(head["training"])
+    if "arguments" in head:  # version 0.1 kept the weights of the loss among the settings
+        names = network.loss_settings
+        loss = {name: value for name, value in head["arguments"].items() if name in names}
+        training["loss"] = {"ssim_weight": 1.0} | loss  # it was fixed then
+    new = new_header(head["method"], settings, head["scale"], training=training)
+    new["jaxsr"] = head["jaxsr"]  # that trained it
+    with tempfile.TemporaryDirectory() as folder:
+        copy = Path(folder) / file.name
+        save_weights(copy, arrays, new, half=True)
+        written, _ = load_weights(copy)
+        if written.keys() != arrays.keys() or any((written[k] != arrays[k]).any() for k in arrays):
+            raise JaxsrError("the arrays would change", where=file, expected="arrays of float16")
+    save_weights(file, arrays, new, half=True)
+
+
 def release(name: str, run: Run, weights: Path, head: dict[str, Any]) -> None:
     """Measure the file as it ships, and write the card and the numbers."""
-    with tempfile.TemporaryDirectory() as folder, bars() as progress:
+    with tempfile.TemporaryDirectory() as folder, Bars() as progress:
         sample = unpack_sample(Path(folder) / "sample", "test", run.scenes, run.config.scale, progress)
         sections = evaluate(
             sample,
@@ -110,14 +147,15 @@ def card(name: str, run: Run, head: dict[str, Any], sections: list[SequenceResul
     """The model card as Markdown."""
     sizes = {name: math.prod(array.shape) for name, array in load_weights(weights)[0].items()}
     statistics = sum(size for name, size in sizes.items() if name.endswith((".mean", ".var")))
-    training, arguments = head["training"], head["arguments"]
-    values = {**arguments, **training["config"], **training["made"]}
+    training, settings = head["training"], head["settings"]
+    values = {**settings, **training["loss"], **training["config"], **training["made"]}
     values |= {
         "name": name,
         "weights": f"{sum(sizes.values()) - statistics:,}",
         "statistics": f"{statistics:,}",
         "megabytes": f"{weights.stat().st_size / 1e6:.2f}",
-        "buffers": ", ".join(arguments["buffers"]),
+        "buffers": ", ".join(settings["buffers"]),
+        "color": "lighting" if settings["demodulated"] else "display",
         "clips": len(training["sequences"]),
         "scenes": ", ".join(run.scenes),
         "hours": f"{training['seconds'] / 3600:.2f}",

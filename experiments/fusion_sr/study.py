@@ -40,8 +40,9 @@ from jaxsr.evaluation.measuring import Reference  # noqa: E402
 from jaxsr.evaluation.running import Evaluation, Settings, run_method  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
-from jaxsr.methods import LEARNED, Method, build, fusion_sr  # noqa: E402
-from jaxsr.progress import bars  # noqa: E402
+from jaxsr.methods import LEARNED, Method, from_json, fusion_sr, to_json  # noqa: E402
+from jaxsr.methods.legacy import upgrade  # noqa: E402
+from jaxsr.progress import Bars  # noqa: E402
 from jaxsr.report.tables import json_value  # noqa: E402
 from jaxsr.runtime.load import LoadedMethod, find_method  # noqa: E402
 from jaxsr.training.config import TrainConfig  # noqa: E402
@@ -52,8 +53,15 @@ RUNS = ROOT / "experiments" / "cache" / "study"
 SCALE, WARM_UP, WINDOW = 4, 4, 5
 CLIPS = 3
 """Training clips of each scene, of the five that the training set has."""
-LOSS = {"ssim_weight": 1.0, "l1_weight": 1.0, "perceptual_weight": 0.0}
-PAPER = {"color": "display", "start": "nothing"}
+LOSS: dict[str, Any] = {
+    "ssim_weight": 1.0,
+    "l1_weight": 1.0,
+    "perceptual_weight": 0.0,
+    "frames": WINDOW,
+}
+"""As far as the loss of a network has such fields; the last one is RRN's."""
+LOSS_NAMES = (*LOSS, "perceptual_crop")
+PAPER = {"demodulated": False, "base": "none"}
 """The picture from colour and G-buffer alone, as published; the default corrects a guided upsampling."""
 ZERO = PAPER | {"residual": "zero"}
 """The same, its residuals begun at 0: with so few steps the published beginning costs more than a decibel,
@@ -71,17 +79,23 @@ class Variant:
 
     label: str
     method: str
-    arguments: dict[str, Any] | None = None
-    """Of the network; None for a method that learns nothing."""
+    changes: dict[str, Any] | None = None
+    """Settings of the network other than the defaults; None for a method that learns nothing."""
     learning_rate: float = 1e-3
     """By `rates.py`; of what is made of `fusion`, that of `fusion`."""
 
     def build(self) -> Method:
-        """The method with the loss of the study, as far as it has such options, on windows of one length."""
-        assert self.arguments is not None
-        known = {field.name for field in dataclasses.fields(LEARNED[self.method].options)}
-        loss = {name: weight for name, weight in LOSS.items() if name in known}
-        return build(self.method, loss | self.arguments)._replace(window=WINDOW)
+        """The method with the loss of the study, on windows of one length."""
+        assert self.changes is not None
+        learned = LEARNED[self.method]
+        settings = from_json(learned.options, to_json(learned.options()) | self.changes)
+        loss = learned.loss()
+        known = {field.name for field in dataclasses.fields(loss)}
+        loss = replace(loss, **{name: value for name, value in LOSS.items() if name in known})
+        method = learned.method(settings, loss)
+        assert method.network is not None
+        windows = method.network.windows._replace(length=WINDOW)
+        return method._replace(network=method.network._replace(windows=windows))
 
 
 def without(*names: str) -> dict[str, Any]:
@@ -95,7 +109,7 @@ VARIANTS = {
     "guided-taau": Variant("guided TAAU", "guided-taau"),
     "rcan": Variant("RCAN 5x4x64", "rcan", {"groups": 5, "blocks": 4}),
     "nsrr": Variant("NSRR", "nsrr", {}),
-    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64, "frames": WINDOW}, 1e-4),
+    "rrn": Variant("RRN 5x64", "rrn", {"blocks": 5, "features": 64}, 1e-4),
     "fusion": Variant("fusion", "fusion-sr", PAPER),
     "fusion-guided": Variant("fusion, guided start", "fusion-sr", {}),
     "fusion-zero": Variant("fusion, residuals from 0", "fusion-sr", ZERO),
@@ -142,7 +156,7 @@ def training_clips(data: Path) -> tuple[Path, ...]:
 
 def results_file(name: str, seed: int, results: Path = RESULTS) -> Path:
     """Where the numbers of a run are; of what learns nothing there is one run."""
-    return results / (f"{name}.json" if VARIANTS[name].arguments is None else f"{name}-s{seed}.json")
+    return results / (f"{name}.json" if VARIANTS[name].changes is None else f"{name}-s{seed}.json")
 
 
 def record_of(run: Path) -> dict[str, Any]:
@@ -153,7 +167,8 @@ def record_of(run: Path) -> dict[str, Any]:
     wanted = ("step", "loss", "eval/psnr", "eval/ssim")
     folders = ("data", "eval_data", "out", "cache", "init")
     return {
-        "arguments": record["arguments"],
+        "settings": record["settings"],
+        "loss": record["loss"],
         "config": {key: value for key, value in record["config"].items() if key not in folders},
         "sequences": record["sequences"],
         "trained": record["made"] | {"seconds": round(float(rows[-1]["seconds"]), 1)},
@@ -161,10 +176,21 @@ def record_of(run: Path) -> dict[str, Any]:
     }
 
 
+def settings_of(run: dict[str, Any]) -> dict[str, Any]:
+    """The settings of the network and the weights of its loss that a file of results records.
+
+    Files of version 0.1 have both as "arguments", under earlier names and without the filters' constants.
+    """
+    if "arguments" not in run:
+        return run["settings"] | run["loss"]
+    loss = {name: run["arguments"][name] for name in LOSS_NAMES if name in run["arguments"]}
+    return upgrade(run["method"], run["arguments"]) | {"ssim_weight": 1.0} | loss  # it was fixed for some
+
+
 def measure(ready: LoadedMethod, clips: list[Path], frames: Path) -> dict[str, Any]:
     """Every metric of every measured frame, by scene; the frames that were made stay in `frames`."""
     scenes, begun = {}, time.monotonic()
-    with bars() as progress:
+    with Bars() as progress:
         sequences = [FrameSequence.open(clip) for clip in clips]
         advance = progress("measure", 2 * sum(map(len, sequences)))
         for sequence in sequences:
@@ -187,7 +213,7 @@ def run(name: str, seed: int, data: tuple[Path, ...], runs: Path, clips: list[Pa
     """Train, measure, and say all that there is to say of it."""
     variant, out = VARIANTS[name], runs / results_file(name, seed).stem
     found: dict[str, Any] = {"name": name, "label": variant.label, "method": variant.method}
-    if variant.arguments is None:
+    if variant.changes is None:
         ready = find_method(variant.method, SCALE)
     else:
         config = replace(BUDGET, seed=seed, learning_rate=variant.learning_rate, data=data, out=out)
@@ -219,13 +245,13 @@ def main(
         (name, seed)
         for seed in seeds
         for name, variant in chosen(names).items()
-        if (variant.arguments is not None or seed == seeds[0])
+        if (variant.changes is not None or seed == seeds[0])
         and (again or not results_file(name, seed, results).is_file())
     ]
     if not todo:
         print(f"all is there; tables.py makes the tables of {results}")
         return
-    learns = any(VARIANTS[name].arguments is not None for name, _ in todo)
+    learns = any(VARIANTS[name].changes is not None for name, _ in todo)
     folders = training_clips(data) if learns else ()
     with tempfile.TemporaryDirectory() as folder:
         clips = unpack_sample(Path(folder), "test", scale=SCALE)

@@ -26,13 +26,20 @@ import tyro  # noqa: E402
 from tyro.conf import Positional  # noqa: E402
 
 from experiments.fusion_sr.figures import Shown, sheet  # noqa: E402
-from experiments.fusion_sr.study import RESULTS, RUNS, SCALE, VARIANTS, WARM_UP, results_file  # noqa: E402
+from experiments.fusion_sr.study import (  # noqa: E402
+    RESULTS,
+    RUNS,
+    SCALE,
+    VARIANTS,
+    WARM_UP,
+    results_file,
+    settings_of,
+)
 from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.images import read_png, write_png  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
-from jaxsr.methods import build  # noqa: E402
 from jaxsr.metrics import METRICS  # noqa: E402
 from jaxsr.runtime.upscale import display  # noqa: E402
 
@@ -140,7 +147,7 @@ def load(results: Path = RESULTS) -> dict[str, list[dict[str, Any]]]:
     found: dict[str, list[dict[str, Any]]] = {}
     for name, variant in VARIANTS.items():
         files = [results_file(name, 0, results)]
-        if variant.arguments is not None:
+        if variant.changes is not None:
             files = sorted(results.glob(f"{name}-s*.json"))
         runs = [json.loads(file.read_text(encoding="utf-8")) for file in files if file.is_file()]
         if runs:
@@ -287,9 +294,9 @@ def _check_fair(here: Mapping[str, list[dict[str, Any]]]) -> None:
     same("test clips", lambda run: {s: (v["sequence"], v["frames"]) for s, v in run["scenes"].items()}, runs)
     same("display", lambda run: run["measured"]["display"], runs)
     for run in trained:
-        variant = VARIANTS[run["name"]]
-        expected = variant.build().arguments
-        found = build(variant.method, run["arguments"]).arguments  # with today's defaults of newer options
+        network = VARIANTS[run["name"]].build().network
+        assert network is not None
+        expected, found = {**network.settings, **network.loss_settings}, settings_of(run)
         if found != expected:
             raise JaxsrError(
                 f"{run['name']} was another network",

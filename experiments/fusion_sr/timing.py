@@ -42,6 +42,7 @@ from jaxsr.data import analytic  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.methods import METHODS  # noqa: E402
+from jaxsr.methods.base import step as step_of  # noqa: E402
 from jaxsr.provenance import commit, machine  # noqa: E402
 from jaxsr.runtime.cost import count_parameters, multiply_adds_of  # noqa: E402
 
@@ -78,11 +79,12 @@ app = tyro.extras.SubcommandApp()
 
 def prepare(variant: Variant) -> tuple[Callable[[], Any], dict[str, Any]]:
     """A call that makes one frame with a full history, compiled; and what it costs."""
-    method = METHODS[variant.method] if variant.arguments is None else variant.build()
-    net = None if method.new_net is None else jax.jit(lambda: nnx.state(method.new_net(nnx.Rngs(0))))()
+    method = METHODS[variant.method] if variant.changes is None else variant.build()
+    network = method.network
+    net = None if network is None else jax.jit(lambda: nnx.state(network.new(nnx.Rngs(0))))()
     first, second = (jax.device_put(analytic.frame(t, SIZE, SCALE, JITTER[t])[0]) for t in (0, 1))
     start = time.perf_counter()
-    traced = jax.jit(method.step).trace(net, jax.eval_shape(method.init, first), first)
+    traced = jax.jit(step_of(method)).trace(net, jax.eval_shape(method.init, first), first)
     step = traced.lower().compile()
     seconds = time.perf_counter() - start
     state, _ = step(net, jax.jit(method.init)(first), first)

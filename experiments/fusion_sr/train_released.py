@@ -21,10 +21,11 @@ from tyro.conf import Positional  # noqa: E402
 from experiments.make_datasets import CACHE, Render, clips_of  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.methods import fusion_sr  # noqa: E402
+from jaxsr.methods.image_loss import ImageLoss  # noqa: E402
 from jaxsr.training.config import TrainConfig  # noqa: E402
 from jaxsr.training.loop import train  # noqa: E402
 
-OPTIONS = fusion_sr.Options(l1_weight=1.0, perceptual_crop=48)
+OPTIONS, LOSS = fusion_sr.Options(), ImageLoss(l1_weight=1.0, perceptual_crop=48)
 BASE = TrainConfig(
     steps=2500,
     batch=8,
@@ -100,7 +101,7 @@ def main(
     for name, run in chosen(names).items():
         start = None if run.start is None else runs / run.start / "weights.safetensors"
         config = replace(run.config, data=folders_of(run.scenes, data), out=runs / name, init=start)
-        print(f"{name}: {train(fusion_sr.method(OPTIONS), config)}")
+        print(f"{name}: {train(fusion_sr.method(OPTIONS, LOSS), config)}")
 
 
 if __name__ == "__main__":

@@ -75,4 +75,16 @@ def variant(name: str, changes: Mapping[str, Any]) -> Method:
     return build(name, defaults | dict(changes))
 
 
-__all__ = ["LEARNED", "METHODS", "Learned", "Method", "Needs", "Network", "Windows", "build", "variant"]
+__all__ = [
+    "LEARNED",
+    "METHODS",
+    "Learned",
+    "Method",
+    "Needs",
+    "Network",
+    "Windows",
+    "build",
+    "from_json",
+    "to_json",
+    "variant",
+]

@@ -57,7 +57,7 @@ class Options:
             raise JaxsrError("bad strides", where="strides", expected="spacings from 1", found=self.strides)
 
 
-def surface_of(gbuffer: GBuffer) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 3"]]:
+def surface_of(gbuffer: GBuffer) -> tuple[Float[Array, "*b H W 3"], Float[Array, "*b H W 3"]]:
     """Base colour and normal; the needs of the method promise that they are there."""
     assert gbuffer.base_color is not None
     assert gbuffer.normal is not None
@@ -69,15 +69,20 @@ def guide(gbuffer: GBuffer) -> Float[Array, "H W 6"]:
     return jnp.concatenate(surface_of(gbuffer), -1)
 
 
-def lighting_of(color_linear: Float[Array, "H W 3"], gbuffer: GBuffer, eps: float) -> Float[Array, "H W 3"]:
+def lighting_of(
+    color_linear: Float[Array, "*b H W 3"], gbuffer: GBuffer, eps: float
+) -> Float[Array, "*b H W 3"]:
     """Colour over base colour; sky keeps its colour."""
-    base_color = surface_of(gbuffer)[0]
+    base_color = gbuffer.base_color
+    assert base_color is not None  # as in `surface_of`; normals are not needed here
     return demodulate(color_linear, base_color, surface=surface(gbuffer.depth_linear), eps=eps)
 
 
-def color_of(lighting: Float[Array, "H W 3"], gbuffer: GBuffer, eps: float) -> Float[Array, "H W 3"]:
+def color_of(lighting: Float[Array, "*b H W 3"], gbuffer: GBuffer, eps: float) -> Float[Array, "*b H W 3"]:
     """The inverse of `lighting_of`."""
-    return modulate(lighting, surface_of(gbuffer)[0], surface=surface(gbuffer.depth_linear), eps=eps)
+    base_color = gbuffer.base_color
+    assert base_color is not None
+    return modulate(lighting, base_color, surface=surface(gbuffer.depth_linear), eps=eps)
 
 
 def keep(image: Float[Array, "H W 3"], frame: Frame) -> History:

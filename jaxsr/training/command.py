@@ -45,7 +45,7 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
     has_scale = any(field.name == "scale" for field in dataclasses.fields(options))
     groups = [
         ("training", TrainConfig, TrainConfig()),
-        ("method", _without_groups(options), options()),
+        ("method", (offered := _without_groups(options)), offered()),
         ("loss", loss, loss()),
     ]
     chosen: Any = tyro.cli(
@@ -55,9 +55,8 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
         description=DESCRIPTION,
         config=(tyro.conf.OmitArgPrefixes,),
     )
-    config, settings = chosen.training, chosen.method
-    if has_scale:
-        settings = dataclasses.replace(settings, scale=config.scale)
+    config, given = chosen.training, vars(chosen.method)
+    settings = options(**given | ({"scale": config.scale} if has_scale else {}))
     method = learned[name].method(settings, chosen.loss)
     weights = train(method, config)
     print(f"{weights}: use it with `jaxsr upscale SEQ --method {weights} --scale {config.scale}`")

@@ -297,13 +297,16 @@ def test_methods_are_found(data, tmp_path, monkeypatch):
         with pytest.raises(JaxsrError, match=words) as error:
             find_method(name, scale)
         assert "\n" not in str(error.value)
+    settings = dict(METHODS["fusion-sr"].network.settings)
     for changes, words in (
         ({"method": "magic"}, "no method 'magic' that learns"),
         ({"method": ["taau"]}, "does not say which method"),
         ({"scale": None}, "header of the weights is damaged.*found scale None"),
-        ({"arguments": [1]}, "header of the weights is damaged"),
-        ({"arguments": {"depth": 3}}, "has no argument 'depth'"),
-        ({"arguments": {"architecture": "unet"}}, "the weights do not fit the network"),
+        ({"format": 3}, "weights of another version; expected 2; found 3; update jaxsr"),
+        ({"settings": [1]}, "header of the weights is damaged"),
+        ({"settings": {}}, "the setting 'architecture' is missing"),
+        ({"settings": settings | {"depth": 3}}, "no setting 'depth' is known"),
+        ({"settings": settings | {"architecture": "unet"}}, "the weights do not fit the network"),
     ):
         with pytest.raises(JaxsrError, match=words):
             find_method(saved("odd", **changes), 2)

@@ -19,7 +19,7 @@ from jaxsr.runtime.stream import stream
 from jaxsr.training import TrainConfig, train
 from tests.builders import make_sequence
 
-LEARNING = [name for name, variant in study.VARIANTS.items() if variant.arguments is not None]
+LEARNING = [name for name, variant in study.VARIANTS.items() if variant.changes is not None]
 
 WEIGHTS = {
     "rcan": 2_009_235,
@@ -32,7 +32,13 @@ WEIGHTS = {
     "add": 318_939,
     "unet": 506_907,
     "depth-only": 418_627,
+    "no-base-color": 418_622,
+    "no-normal": 418_622,
+    "no-depth": 418_620,
+    "no-roughness": 418_620,
+    "no-metallic": 418_620,
 }
+"""Learned numbers, as the measured files have them too."""
 
 
 def made(name, seed=0, psnr=20.0, **changes):
@@ -45,16 +51,26 @@ def made(name, seed=0, psnr=20.0, **changes):
         "measured": {"display": "sRGB", "date": "2026-01-01", "commit": "abc"},
         "cost": {"parameters": 7, "multiply_adds_per_px": 8.0},
     }
-    if study.VARIANTS[name].arguments is not None:
+    if study.VARIANTS[name].changes is not None:
+        network = study.VARIANTS[name].build().network
         config = {"steps": 3, "batch": 1, "crop": 8, "scale": 4, "learning_rate": 1e-3}
         found |= {
             "seed": seed,
             "config": config | {"schedule": "cosine", "clip_norm": 1.0},
-            "arguments": json.loads(json.dumps(dict(study.VARIANTS[name].build().network.settings))),
+            "settings": json.loads(json.dumps(dict(network.settings))),
+            "loss": json.loads(json.dumps(dict(network.loss_settings))),
             "sequences": ["clip hash"],
             "trained": {"commit": "abc", "device": "cpu", "seconds": 3600},
         }
     return found | changes
+
+
+@pytest.mark.parametrize("file", sorted(study.RESULTS.glob("*-s[0-9].json")), ids=lambda file: file.stem)
+def test_the_settings_in_the_committed_files_are_those_of_the_study(file):
+    """Also where version 0.1 wrote them, under other names."""
+    run = json.loads(file.read_text())
+    network = study.VARIANTS[run["name"]].build().network
+    assert study.settings_of(run) == {**network.settings, **network.loss_settings}
 
 
 @pytest.mark.parametrize("name", LEARNING)
@@ -62,19 +78,16 @@ def test_a_variant_is_the_network_that_its_label_says(name):
     method = study.VARIANTS[name].build()
     state = nnx.eval_shape(lambda: nnx.state(method.network.new(nnx.Rngs(0))))
     count = sum(int(np.prod(leaf.shape)) for leaf in jax.tree.leaves(nnx.filter_state(state, nnx.Param)))
-    expected = {
-        "nsrr": 547_767,
-        "fusion": 418_619,
-        "unet": 506_907,
-    }
-    assert count == expected.get(name, count) > 100_000
+    assert count == WEIGHTS[name]
     seen = {
         word for word in ("depth", "base-color", "normal", "roughness", "metallic") if f"no-{word}" == name
     }
     if seen:
         assert not {f"hr.{word.replace('-', '_')}" for word in seen} & method.needs.of(True)
-    assert method.network.settings["ssim_weight"] == method.network.settings["l1_weight"] == 1
-    assert method.network.settings["perceptual_weight"] == 0
+    loss = method.network.loss_settings
+    assert (loss["ssim_weight"], loss["l1_weight"], loss["perceptual_weight"]) == (1, 1, 0)
+    assert method.network.windows.length == 5
+    assert loss.get("frames", 5) == 5
 
 
 def test_names_are_checked_before_any_work(tmp_path):
@@ -124,7 +137,8 @@ def test_a_table_has_the_papers_numbers_beside_ours():
         ({"config": made("nsrr")["config"] | {"steps": 4}}, "options of nsrr"),
         ({"config": made("nsrr")["config"] | {"flips": False}}, "options of nsrr"),
         ({"sequences": ["clip other"]}, "training clips of nsrr"),
-        ({"arguments": {"previous": 3}}, "nsrr was another network"),
+        ({"settings": made("nsrr")["settings"] | {"previous": 3}}, "nsrr was another network"),
+        ({"loss": made("nsrr")["loss"] | {"l1_weight": 0.5}}, "nsrr was another network"),
         ({"measured": {"display": "linear", "date": "", "commit": None}}, "display of nsrr"),
         ({"seed": 1}, "no seed that all were trained with"),
     ],
@@ -157,12 +171,14 @@ def test_differences_are_seed_against_seed():
 def test_learning_rates_are_those_that_were_best():
     """Of each architecture; others have that of theirs."""
     files = {file.stem: json.loads(file.read_text()) for file in (study.RESULTS / "rates").glob("*.json")}
-    for name in rates.ARCHITECTURES if files else ():
+    assert {file["name"] for file in files.values()} == set(rates.ARCHITECTURES)
+    for name in rates.ARCHITECTURES:
         ssim = {
             f["config"]["learning_rate"]: f["curve"][-1]["eval/ssim"]
             for f in files.values()
             if f["name"] == name
         }
+        assert len(ssim) > 1
         assert study.VARIANTS[name].learning_rate == max(ssim, key=ssim.get), name
 
 

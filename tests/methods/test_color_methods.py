@@ -9,14 +9,14 @@ import numpy as np
 import optax
 import pytest
 from flax import nnx
-from jaxsr.methods._color import ColorOptions, without_jitter
 
 from jaxsr.data.windows import WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.io.images import read_png
-from jaxsr.methods import LEARNED, METHODS, build, rcan, rrn
+from jaxsr.methods import LEARNED, METHODS, build, rcan, rrn, variant
 from jaxsr.methods.base import step
+from jaxsr.methods.color_only import ColorOptions, without_jitter
 from jaxsr.ops import backward_warp, from_display, sample_jittered, to_display, upsample
 from jaxsr.runtime.load import find_method
 from jaxsr.training import TrainConfig, train
@@ -30,8 +30,8 @@ NAMES = sorted(SMALL)
 
 
 @functools.cache
-def method_of(name, **arguments):
-    return build(name, SMALL[name] | {"scale": 2} | arguments)
+def method_of(name, **changes):
+    return variant(name, SMALL[name] | {"scale": 2} | changes)
 
 
 @functools.cache
@@ -247,7 +247,7 @@ def test_frames_of_another_scale_are_named(name):
         step(method_of(name))(state_of(name), method_of(name).init(frame), frame)
     net = drawn(lambda rngs: method_of(name).network.new(rngs))
     with pytest.raises(JaxsrError, match=message):
-        method_of(name).loss(net, window([(frame, truth)] * 3))
+        method_of(name).network.loss(net, window([(frame, truth)] * 3))
 
 
 # What is RRN's alone.
@@ -302,7 +302,7 @@ def test_rrn_s_loss_is_over_every_frame_from_an_empty_past(cut):
     """As streaming makes them, whether or not the first frame of the window has a past that it leaves out."""
     net = drawn(lambda rngs: method_of("rrn").network.new(rngs))
     seen = [frame_at(t) for t in range(3)]
-    total, parts = method_of("rrn").loss(net, window(seen, cut))
+    total, parts = method_of("rrn").network.loss(net, window(seen, cut))
     pairs = zip(streamed("rrn"), seen, strict=False)
     errors = [np.abs(to_display(image) - to_display(truth)).mean() for image, (_, truth) in pairs]
     # Streaming clips to [0, 1], which the random network leaves.
@@ -319,7 +319,7 @@ def test_rcan_s_loss_is_that_of_the_last_frame():
     net = drawn(lambda rngs: method_of("rcan").network.new(rngs))
     (_, wrong), (frame, truth) = frame_at(1), frame_at(2)
     frame = frame._replace(exposure=jnp.asarray(0.5))
-    total, parts = method_of("rcan").loss(net, window([(frame_at(1)[0], wrong), (frame, truth)]))
+    total, parts = method_of("rcan").network.loss(net, window([(frame_at(1)[0], wrong), (frame, truth)]))
     made = rcan.displayed(net, batched(frame), rcan.Options(scale=2, **SMALL["rcan"]))
     assert float(total) == pytest.approx(float(jnp.mean(jnp.abs(made[0] - to_display(truth, 0.5)))), rel=1e-5)
     assert set(parts) == {"l1", "ssim"}
@@ -328,14 +328,14 @@ def test_rcan_s_loss_is_that_of_the_last_frame():
 @pytest.mark.parametrize("name", NAMES)
 def test_it_learns_one_window(name):
     """From where training begins, not where `drawn` does: RRN's tame weights take a hundred steps to wake."""
-    method = build(name, SMALL[name] | {"scale": 2, "features": 16})
+    method = variant(name, SMALL[name] | {"scale": 2, "features": 16})
     graph, params = nnx.split(method.network.new(nnx.Rngs(0)))
     optimizer, seen = optax.adam(1e-3), window([frame_at(t) for t in range(method.network.windows.length)])
 
     @jax.jit
     def step(params, opt):
         def loss(params):
-            return method.loss(nnx.merge(graph, params, copy=True), seen)[0]
+            return method.network.loss(nnx.merge(graph, params, copy=True), seen)[0]
 
         error, grads = jax.value_and_grad(loss)(params)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers with floats
@@ -358,7 +358,7 @@ def test_gradients_are_finite_in_the_dark_and_in_the_sun(name, factor):
     pairs = [
         (f._replace(color_linear=factor * f.color_linear), factor * t) for f, t in map(frame_at, range(3))
     ]
-    loss = lambda params: method.loss(nnx.merge(graph, params), window(pairs))[0]  # noqa: E731
+    loss = lambda params: method.network.loss(nnx.merge(graph, params), window(pairs))[0]  # noqa: E731
     value, grads = jax.jit(jax.value_and_grad(loss))(params)
     assert np.isfinite(value)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(grads))
@@ -382,8 +382,8 @@ def test_windows_leave_out_the_past(tmp_path):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_arguments_in_json_build_the_same_method(name):
-    method = method_of(name, dtype="bfloat16", ssim_weight=0.5)
+def test_settings_in_json_build_the_same_method(name):
+    method = method_of(name, dtype="bfloat16", unjitter=False)
     again = build(name, json.loads(json.dumps(dict(method.network.settings))))
     assert again.network.settings == method.network.settings
     assert (again.needs.of(True), again.network.windows.length) == (
@@ -393,12 +393,14 @@ def test_arguments_in_json_build_the_same_method(name):
 
 
 def test_they_are_among_the_methods():
-    assert METHODS["rcan"].network.settings == build("rcan", {}).network.settings
-    assert (METHODS["rcan"].window, METHODS["rrn"].window, method_of("rrn").window) == (1, 4, 3)
+    assert METHODS["rcan"].network.settings == variant("rcan", {}).network.settings
+    assert (METHODS["rcan"].network.windows.length, METHODS["rrn"].network.windows.length) == (1, 4)
+    assert rrn.method(loss=rrn.Loss(frames=3)).network.windows.length == 3
     for name in NAMES:
         options = LEARNED[name].options()
         assert isinstance(options, ColorOptions)
-        assert (options.ssim_weight, options.l1_weight, options.perceptual_weight) == (0, 1, 0)
+        loss = LEARNED[name].loss()
+        assert (loss.ssim_weight, loss.l1_weight, loss.perceptual_weight) == (0, 1, 0)
         with pytest.raises(JaxsrError, match=f"no weights of '{name}' for scale 4; found no weights of it"):
             find_method(name, 4)
 
@@ -412,17 +414,19 @@ def test_they_are_among_the_methods():
         ("rrn", {"scale": 1}, "scale: bad scale"),
         ("rrn", {"blocks": 0}, "blocks: bad blocks"),
         ("rrn", {"frames": 0}, "frames: bad frames; expected a whole number of at least 1; found 0"),
-        ("rrn", {"features": "many"}, "features: bad features; expected a whole number; found many"),
+        ("rrn", {"frames": 10**9}, "frames: bad frames; expected a whole number from 0 to 4096"),
+        ("rrn", {"blocks": 10**7}, "blocks: bad blocks; expected a whole number from 0 to 4096"),
+        ("rrn", {"features": "many"}, "features: bad features; expected a whole number .*; found many"),
         ("rcan", {"l1_weight": 0.0}, "a loss of nothing"),
         ("rcan", {"dtype": "float16"}, "dtype"),
     ],
 )
 def test_bad_options_are_named(name, arguments, match):
-    options = LEARNED[name].options()  # tests alone check the types of what it is made from
-    for field, value in arguments.items():
-        object.__setattr__(options, field, value)
+    options, loss = LEARNED[name].options(), LEARNED[name].loss()
+    for field, value in arguments.items():  # not through the constructors: tests alone check types there
+        object.__setattr__(options if hasattr(options, field) else loss, field, value)
     with pytest.raises(JaxsrError, match=match):
-        LEARNED[name].method(options)
+        LEARNED[name].method(options, loss)
 
 
 def test_a_training_of_another_scale_is_named(tmp_path):
@@ -461,8 +465,8 @@ def test_train_upscale_and_evaluate(name, tmp_path, capsys):
     assert "step 1: loss" in err
     weights = tmp_path / "run" / "weights.safetensors"
     header = load_weights(weights)[1]
-    assert (header["method"], header["scale"], header["arguments"]["scale"]) == (name, 2, 2)
-    assert header["arguments"].items() >= SMALL[name].items()
+    assert (header["method"], header["scale"], header["settings"]["scale"]) == (name, 2, 2)
+    assert header["settings"].items() >= SMALL[name].items()
     clip = tmp_path / "data" / "clip"
     status, out, err = run(capsys, "upscale", clip, "--method", weights, "--every", 2, "-o", tmp_path / "up")
     assert status == 0, err

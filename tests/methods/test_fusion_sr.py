@@ -15,13 +15,14 @@ from flax import nnx
 
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Window
-from jaxsr.methods import METHODS, build, fusion_sr, guided, guided_taau, taau
+from jaxsr.frames import FIELDS, Window
+from jaxsr.methods import METHODS, build, fusion_sr, guided, guided_taau, taau, variant
 from jaxsr.methods.base import step
 from jaxsr.methods.fusion_sr import Options, displayed
-from jaxsr.methods.image_loss import middle
+from jaxsr.methods.image_loss import ImageLoss, middle
+from jaxsr.methods.options import from_json
 from jaxsr.nets import blocks as layers
-from jaxsr.ops import backward_warp, modulate, to_display, upsample, zero_upsample
+from jaxsr.ops import backward_warp, to_display, upsample, zero_upsample
 from jaxsr.ops.encoding import compress_lighting, expand_lighting, normalized_depth, sample_offset
 from tests.networks import drawn
 
@@ -41,7 +42,7 @@ VARIANTS = {
 
 @functools.cache
 def method_of(name):
-    return build("fusion-sr", VARIANTS[name])
+    return variant("fusion-sr", VARIANTS[name])
 
 
 @functools.cache
@@ -140,11 +141,11 @@ def test_lighting_is_compressed_and_expanded():
         assert np.isfinite(slope).all()
 
 
-@pytest.mark.parametrize("color", ["display", "lighting"])
+@pytest.mark.parametrize("demodulated", [False, True])
 @pytest.mark.parametrize("exposure", [0.25, 3.0])
-def test_a_network_that_passes_colour_on_gives_the_colour(color, exposure):
+def test_a_network_that_passes_colour_on_gives_the_colour(demodulated, exposure):
     """What the network sees is turned back into scene-linear colour by the inverse of the same map."""
-    options = Options(color=color, base="none")
+    options = Options(demodulated=demodulated, base="none")
     frame, _ = frame_at(0)
     enlarged = functools.partial(upsample, scale=2, mode="nearest")
     flat = [jnp.asarray(np.random.default_rng(s).random((8, 12, 3), np.float32)) for s in (0, 1)]
@@ -267,8 +268,8 @@ def test_an_extrapolated_frame_never_sees_its_colour():
 
 def test_it_extrapolates_by_guided_reprojection_of_its_output():
     frames = clip()
-    history = taau.State(streamed()[0], jnp.ones((*SIZE[::-1], 1)), frames[0].hr.depth_linear)
-    state = guided.State(history, *guided.surface_of(frames[0].hr))
+    last = guided.keep(jnp.asarray(streamed()[0]), frames[0])
+    state = taau.State(last, jnp.ones((*SIZE[::-1], 1)))
     _, expected = guided.extrapolate(guided.Options(), state, frames[1])
     np.testing.assert_allclose(streamed()[1], expected, rtol=1e-4, atol=1e-5)
 
@@ -315,12 +316,11 @@ def test_any_size_and_scale(size, scale):
 
 @pytest.mark.parametrize("name", VARIANTS)
 def test_variants_see_only_what_they_need(name):
-    """Buffers that are not asked for are not there; depth and motion every sequence has."""
+    """Buffers that are not asked for are not there."""
     method, frame = method_of(name), frame_at(0)[0]
     for place in ("lr", "hr"):
         gbuffer = getattr(frame, place)
-        names = ("normal", "base_color", "roughness", "metallic", "object_id")
-        absent = {k: None for k in names if f"{place}.{k}" not in method.needs.of(True)}
+        absent = {field: None for k, field in FIELDS.items() if f"{place}.{k}" not in method.needs.of(True)}
         frame = frame._replace(**{place: gbuffer._replace(**absent)})
     _, image = jax.eval_shape(step(method), state_of(name), method.init(frame), frame)
     assert image.shape == (*SIZE[::-1], 3)
@@ -337,12 +337,12 @@ def test_variants_run(name):
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_arguments_in_json_build_the_same_method(name):
+def test_settings_in_json_build_the_same_method(name):
     method = method_of(name)
     again = build("fusion-sr", json.loads(json.dumps(dict(method.network.settings))))
     assert again.network.settings == method.network.settings
     assert again.needs.of(True) == method.needs.of(True)
-    assert Options(**again.network.settings) == Options(**VARIANTS[name])
+    assert from_json(Options, again.network.settings) == Options(**VARIANTS[name])
     shapes = [
         jax.tree.map(jnp.shape, nnx.state(nnx.eval_shape(lambda m=m: m.network.new(nnx.Rngs(0)))))
         for m in (method, again)
@@ -352,7 +352,7 @@ def test_arguments_in_json_build_the_same_method(name):
 
 @pytest.mark.parametrize(("architecture", "count"), [("fusion", 418_619), ("unet", 506_907)])
 def test_the_paper_s_form_has_the_paper_s_size(architecture, count):
-    method = build("fusion-sr", PAPER | {"architecture": architecture})
+    method = variant("fusion-sr", PAPER | {"architecture": architecture})
     net = nnx.eval_shape(lambda: method.network.new(nnx.Rngs(0)))
     assert sum(p.size for p in jax.tree.leaves(nnx.state(net, nnx.Param))) == count
     assert method.needs.of(True) == {"lr.color", "hr.motion"} | {f"hr.{k}" for k in fusion_sr.BUFFERS}
@@ -365,10 +365,11 @@ def test_the_paper_s_form_has_the_paper_s_size(architecture, count):
         ({"buffers": []}, "buffers"),
         ({"buffers": ["depth", "depth"]}, "buffers"),
         (
-            {"color": "hdr"},
-            r"color: bad color; expected display \| lighting; found hdr",
+            {"base": "hdr"},
+            r"base: bad base; expected none \| guided; found hdr",
         ),
-        ({"start": "end"}, "start"),
+        ({"demodulated": "lighting"}, "demodulated: bad demodulated; expected true or false; found lighting"),
+        ({"eps": 0.0}, "eps: bad eps; expected a number above 0; found 0"),
         ({"fusion": "product"}, "fusion"),
         ({"architecture": "gan"}, "architecture"),
         ({"down_kernel": 4}, "down_kernel"),
@@ -384,21 +385,29 @@ def test_the_paper_s_form_has_the_paper_s_size(architecture, count):
     ],
 )
 def test_bad_arguments_are_named(arguments, match):
-    options = Options()  # tests alone check the types of what it is made from
-    for name, value in arguments.items():
-        object.__setattr__(options, name, tuple(value) if isinstance(value, list) else value)
+    options, loss = Options(), ImageLoss()
+    for name, value in arguments.items():  # not through the constructors: tests alone check types there
+        value = tuple(value) if isinstance(value, list) else value
+        object.__setattr__(options if hasattr(options, name) else loss, name, value)
     with pytest.raises(JaxsrError, match=match):
-        fusion_sr.method(options)
+        fusion_sr.method(options, loss)
 
 
-def test_arguments_of_another_version_are_named():
-    with pytest.raises(JaxsrError, match="has no argument 'colour'; expected architecture"):
-        build("fusion-sr", {"colour": "display"})
+def test_settings_of_another_version_are_named():
+    settings = dict(METHODS["fusion-sr"].network.settings)
+    with pytest.raises(JaxsrError, match=r"a\.b: no setting 'colour' is known; expected architecture"):
+        build("fusion-sr", settings | {"colour": "display"}, "a.b")
+    del settings["eps"]
+    with pytest.raises(JaxsrError, match=r"a\.b: the setting 'eps' is missing; expected architecture"):
+        build("fusion-sr", settings, "a.b")
+    settings = settings | {"eps": 0.02, "estimate": settings["estimate"] | {"temporal": {"floor": 1.0}}}
+    with pytest.raises(JaxsrError, match=r"a\.b: the setting 'kernel_sigma' is missing"):
+        build("fusion-sr", settings, "a.b")
 
 
 def test_it_is_among_the_methods():
     assert METHODS["fusion-sr"].network.settings == method_of("default").network.settings
-    assert METHODS["fusion-sr"].window == 1
+    assert METHODS["fusion-sr"].network.windows.length == 1
 
 
 def test_untrained_it_is_the_guided_upsampling(monkeypatch):
@@ -414,7 +423,7 @@ def test_untrained_it_is_the_guided_upsampling(monkeypatch):
         _, image = step_of("default")(net, method_of("default").init(frame), frame)
         color = guided_taau.estimate(frame, guided_taau.Options()).color
         estimate = taau.from_working(color, frame.exposure)
-        expected = modulate(estimate, frame.hr.base_color)
+        expected = guided.color_of(estimate, frame.hr, 0.02)
         np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
 
 
@@ -446,11 +455,11 @@ def window(*frames_and_truths):
 @functools.cache
 def training(name):
     """Parameters, the rest, and one compiled update."""
-    options = VARIANTS[name] | {"perceptual_weight": 0.0, "l1_weight": 1.0}
-    method = build("fusion-sr", options)
+    options = Options(**VARIANTS[name])
+    method = fusion_sr.method(options, ImageLoss(perceptual_weight=0.0, l1_weight=1.0))
     net = drawn(lambda rngs: method.network.new(rngs))
     last = net.decoder1.convs.conv2
-    if options.get("start") != "nothing":
+    if options.base == "guided":
         last.kernel[...], last.bias[...] = 0.1 * last.kernel[...], jnp.full_like(last.bias[...], 0.5)
     graph, params, rest = nnx.split(net, nnx.Param, ...)
     optimizer = optax.adam(2e-3)
@@ -459,7 +468,7 @@ def training(name):
     def update(params, rest, opt, window):
         def loss(params):
             net = nnx.merge(graph, params, rest, copy=True)
-            total, parts = method.loss(net, window)
+            total, parts = method.network.loss(net, window)
             return total, (parts, nnx.state(net, nnx.Param, ...)[1])
 
         (total, (parts, new)), gradient = jax.value_and_grad(loss, has_aux=True)(params)
@@ -534,7 +543,9 @@ def test_the_loss_is_its_parts_on_displayed_colour(monkeypatch):
         return jnp.mean(jnp.abs(pred - target))
 
     monkeypatch.setattr("jaxsr.methods.image_loss.lpips", fake)
-    options = Options(base="none", demodulated=False, perceptual_crop=12, l1_weight=0.5)
+    method = fusion_sr.method(
+        Options(base="none", demodulated=False), ImageLoss(perceptual_crop=16, l1_weight=0.5)
+    )
     (frame, truth), (other, wrong) = frame_at(0), frame_at(1)
     frame = frame._replace(exposure=jnp.asarray(0.5))
     frames = jax.tree.map(lambda a, b: jnp.stack([a, b])[None], other, frame)
@@ -544,10 +555,10 @@ def test_the_loss_is_its_parts_on_displayed_colour(monkeypatch):
             return upsample(color, 2, "nearest")
 
     net = Nearest()
-    total, parts = fusion_sr.loss_of(options)(net, Window(frames, jnp.stack([wrong, truth])[None]))
+    total, parts = method.network.loss(net, Window(frames, jnp.stack([wrong, truth])[None]))
     target = to_display(truth, 0.5)
-    np.testing.assert_allclose(seen[0][1][0], target[2:14, 6:18], atol=1e-6)
-    assert seen[0][0].shape == (1, 12, 12, 3)
+    np.testing.assert_allclose(seen[0][1][0], target[:, 4:20], atol=1e-6)
+    assert seen[0][0].shape == (1, 16, 16, 3)
     made = upsample(to_display(frame.color_linear, 0.5), 2, "nearest")
     assert float(parts["l1"]) == pytest.approx(float(jnp.mean(jnp.abs(made - target))), rel=1e-4)
     expected = parts["ssim"] + 0.5 * parts["l1"] + 0.2 * parts["lpips"]

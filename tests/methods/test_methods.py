@@ -16,7 +16,7 @@ from jaxsr.ops import jitter_sequence, to_display
 from jaxsr.runtime.stream import stream
 
 SIZE = (96, 54)
-NAMES = sorted(name for name, method in METHODS.items() if method.network.new is None)
+NAMES = sorted(name for name, method in METHODS.items() if method.network is None)
 """Those that learn nothing; tests/test_fusion_sr.py has the others."""
 
 
@@ -167,12 +167,11 @@ def test_taau_history_does_not_bleed_across_a_silhouette():
     left = jnp.arange(w)[None, :, None] < w // 2
     depth = jnp.broadcast_to(jnp.where(left, 2.0, 10.0), (h, w, 1))
     image = jnp.broadcast_to(jnp.where(left, 1.0, 5.0), (h, w, 3))
-    state = taau.State(image, jnp.ones((h, w, 1)), depth)
     motion = jnp.full((h, w, 2), 0.5)
     here = frame._replace(
         hr=frame.hr._replace(depth_linear=depth, motion_px=motion), reset=jnp.asarray(False)
     )
-    history, weight = taau.fetch_history(state.image, state.weight, state.depth_linear, here, taau.Options())
+    history, weight = taau.fetch_history(image, jnp.ones((h, w, 1)), depth, here, taau.Options())
     right_edge = history[1:, w // 2]  # its left tap lies on the near surface
     np.testing.assert_allclose(right_edge, 5.0, rtol=1e-6)
     assert (weight[1:, w // 2] < 1).all()

@@ -16,8 +16,9 @@ from flax import nnx
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
-from jaxsr.methods import METHODS, build, nsrr
+from jaxsr.methods import METHODS, build, nsrr, variant
 from jaxsr.methods.base import step
+from jaxsr.methods.image_loss import ImageLoss
 from jaxsr.methods.nsrr import Options
 from jaxsr.nets import NSRR
 from jaxsr.nets.nsrr import CHANNELS
@@ -200,7 +201,7 @@ def test_maps_that_do_not_fit_are_named():
 
 @functools.cache
 def method_of(name):
-    return build("nsrr", VARIANTS[name])
+    return variant("nsrr", VARIANTS[name])
 
 
 @functools.cache
@@ -261,7 +262,7 @@ def test_a_window_is_what_streaming_has_seen():
         return history, nsrr.displayed(model, now, history)
 
     history, shown = seen(net, jax.tree.map(lambda x: x[None], batched(*frames)), now)
-    before = streamed()[3][0].history
+    before = streamed()[3][0].previous
     np.testing.assert_allclose(history.features[0], before.features, atol=1e-5)
     np.testing.assert_array_equal(history.offset[0], before.offset)
     paths = compose_motion(frames[-1].hr.motion_px, before.motion_px)
@@ -315,9 +316,9 @@ def test_frames_that_were_not_rendered_are_passed_through():
         (state, image), (expected_state, expected) = with_them[2 + k], without[k]
         np.testing.assert_allclose(image, expected, atol=1e-5)
         kept = slice(2 + 2 * k)  # beyond, paths lead to frames that are not there
-        for a, b in zip(state.history[:2], expected_state.history[:2], strict=True):
+        for a, b in zip(state.previous[:2], expected_state.previous[:2], strict=True):
             np.testing.assert_array_equal(a, b)
-        paths, expected_paths = (s.history.motion_px[..., kept] for s in (state, expected_state))
+        paths, expected_paths = (s.previous.motion_px[..., kept] for s in (state, expected_state))
         np.testing.assert_allclose(paths, expected_paths, atol=1e-5)
     assert np.abs(with_them[3][1] - streamed()[3][1]).max() > 1e-2
 
@@ -342,8 +343,8 @@ def test_an_extrapolated_frame_never_sees_its_colour():
 def test_the_state_keeps_its_size(name):
     state = method_of(name).init(frame_at(0)[0])
     shapes = jax.tree.map(lambda x: (x.shape, x.dtype), state)
-    n = method_of(name).window - 1
-    assert state.history.features.shape == (n, 8, 12, CHANNELS)
+    n = method_of(name).network.windows.length - 1
+    assert state.previous.features.shape == (n, 8, 12, CHANNELS)
     for rendered in (True, False):
         frame, _ = frame_at(1, rendered=rendered)
         after, _ = jax.eval_shape(step(method_of(name)), state_of(name), state, frame)
@@ -358,7 +359,7 @@ def test_after_a_cut_nothing_is_remembered():
     for (state, image), (other, expected) in zip(after, alone, strict=True):
         np.testing.assert_array_equal(image, expected)
         jax.tree.map(np.testing.assert_array_equal, state, other)
-    assert not np.any(alone[0][0].history.features[1:])
+    assert not np.any(alone[0][0].previous.features[1:])
     assert np.abs(alone[0][1] - streamed()[2][1]).max() > 1e-2
 
 
@@ -407,10 +408,10 @@ def test_any_size_and_scale(size, scale):
 
 @pytest.mark.parametrize(("size", "scale"), [((2, 2), 2), ((15, 9), 3)])
 def test_odd_frames_run(size, scale):
-    step = jax.jit(step(method_of("two")))
+    compiled_step = jax.jit(step(method_of("two")))
     state = method_of("two").init(frame_at(0, size, scale)[0])
     for t in range(2):
-        state, image = step(state_of("two"), state, frame_at(t, size, scale)[0])
+        state, image = compiled_step(state_of("two"), state, frame_at(t, size, scale)[0])
         assert np.isfinite(image).all()
         assert (np.asarray(image) >= 0).all()
 
@@ -425,11 +426,11 @@ def test_full_size_frames_pass_unchanged():
     method = method_of("default")
     frames = [frame_at(t, scale=1, rendered=t == 0)[0] for t in range(2)]
     state = method.init(frames[0])
-    assert state.history.features.size == state.history.motion_px.size == 0
-    step = jax.jit(step(method))
-    state, image = step(state_of("default"), state, frames[0])
+    assert state.previous.features.size == state.previous.motion_px.size == 0
+    compiled_step = jax.jit(step(method))
+    state, image = compiled_step(state_of("default"), state, frames[0])
     np.testing.assert_array_equal(image, frames[0].color_linear)
-    _, image = step(state_of("default"), state, frames[1])
+    _, image = compiled_step(state_of("default"), state, frames[1])
     np.testing.assert_allclose(
         image, backward_warp(frames[0].color_linear, frames[1].hr.motion_px), atol=1e-5
     )
@@ -447,7 +448,7 @@ def test_it_sees_only_what_it_needs(name):
 
 
 @pytest.mark.parametrize("name", VARIANTS)
-def test_arguments_in_json_build_the_same_method(name):
+def test_settings_in_json_build_the_same_method(name):
     method = method_of(name)
     again = build("nsrr", json.loads(json.dumps(dict(method.network.settings))))
     assert again.network.settings == method.network.settings
@@ -462,21 +463,21 @@ def test_arguments_in_json_build_the_same_method(name):
     ("arguments", "match"),
     [
         ({"previous": 0}, "previous: bad previous; expected a whole number from 1; found 0"),
-        ({"previous": 1.5}, "previous: bad previous; expected a whole number; found 1.5"),
+        ({"previous": 1.5}, "previous: bad previous; expected a whole number from 0 to 4096; found 1.5"),
         ({"dtype": "float16"}, "dtype"),
         ({"perceptual_weight": -1.0}, "perceptual_weight"),
     ],
 )
 def test_bad_arguments_are_named(arguments, match):
-    options = Options()  # tests alone check the types of what it is made from
-    for name, value in arguments.items():
-        object.__setattr__(options, name, value)
+    options, loss = Options(), ImageLoss()
+    for name, value in arguments.items():  # not through the constructors: tests alone check types there
+        object.__setattr__(options if hasattr(options, name) else loss, name, value)
     with pytest.raises(JaxsrError, match=match):
-        nsrr.method(options)
+        nsrr.method(options, loss)
 
 
 def test_it_is_among_the_methods(tmp_path, monkeypatch):
-    assert METHODS["nsrr"].window == 5
+    assert METHODS["nsrr"].network.windows.length == 5
     monkeypatch.setattr("jaxsr.runtime.load.weights_folder", lambda: tmp_path)
     with pytest.raises(JaxsrError, match=r"no weights of 'nsrr' for scale 4; found no weights of it"):
         find_method("nsrr", 4)
@@ -492,14 +493,15 @@ def window(frames, truths):
 @functools.cache
 def training():
     """Parameters, and one compiled update; with two previous frames."""
-    method = build("nsrr", VARIANTS["two"] | {"perceptual_weight": 0.0, "l1_weight": 1.0})
+    loss = ImageLoss(perceptual_weight=0.0, l1_weight=1.0)
+    method = nsrr.method(Options(**VARIANTS["two"]), loss)
     graph, params = nnx.split(drawn(lambda rngs: method.network.new(rngs)))
     optimizer = optax.adam(2e-3)
 
     @jax.jit
     def update(params, opt, window):
         def loss(params):
-            return method.loss(nnx.merge(graph, params, copy=True), window)
+            return method.network.loss(nnx.merge(graph, params, copy=True), window)
 
         (total, parts), gradient = jax.value_and_grad(loss, has_aux=True)(params)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers with floats

@@ -318,12 +318,14 @@ def test_a_window_is_history(data):
     """A method with a state sees the frames before the one that is measured, the first of them as a cut."""
     seen = []
 
-    def step(net, state, frame):
+    def counted(net, state, frame):
         jax.debug.callback(lambda cut, n: seen.append((bool(cut), int(n))), frame.reset, state)
         return state + 1, jnp.ones_like(frame.hr.base_color)
 
     method = tiny_method.method(window=3)._replace(
-        init=lambda frame: jnp.where(frame.reset, jnp.int32(0), jnp.int32(-1)), step=step
+        init=lambda frame: jnp.where(frame.reset, jnp.int32(0), jnp.int32(-1)),
+        upscale=counted,
+        extrapolate=counted,
     )
     shared = {
         "scale": 2,
@@ -502,7 +504,7 @@ class TestErrors:
             tiny_method.train(tmp_path / "clip", tmp_path / "out")
 
     def test_nothing_to_learn(self, tmp_path):
-        method = tiny_method.method()._replace(new_net=None)
+        method = tiny_method.method()._replace(network=None)
         with pytest.raises(JaxsrError, match="learns nothing"):
             train_method(method, TrainConfig(out=tmp_path), quiet=True)
 

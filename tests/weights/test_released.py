@@ -7,8 +7,9 @@ from pathlib import Path
 import pytest
 
 from experiments.fusion_sr import release, train_released
-from experiments.fusion_sr.train_released import OPTIONS, RUNS
+from experiments.fusion_sr.train_released import LOSS, OPTIONS, RUNS
 from jaxsr.errors import JaxsrError
+from jaxsr.methods import to_json
 from jaxsr.weights.file import load_weights
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -50,8 +51,9 @@ def test_a_network_is_small_and_is_that_of_its_run(name):
     ):
         assert trained["config"][option] == getattr(run.config, option), option
     assert trained["steps"] == run.config.steps
-    assert head["arguments"]["l1_weight"] == OPTIONS.l1_weight
-    assert head["arguments"]["perceptual_crop"] == OPTIONS.perceptual_crop
+    assert head["format"] == 2
+    assert head["settings"] == to_json(OPTIONS)
+    assert trained["loss"] == to_json(LOSS)
     assert {clip.split("-")[0] for clip in trained["sequences"]} == set(run.scenes)
     assert all("-train-" in clip for clip in trained["sequences"])
 

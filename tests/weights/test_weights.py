@@ -29,7 +29,7 @@ from tests.reference import golden_color_nets, golden_fusion_sr
 from tests.test_cli import error_line, run
 
 GOLDENS = Path(__file__).parents[3] / "shared" / "goldens"
-HEADER = {"method": "fusion-sr", "arguments": {"fusion": "add"}, "scale": 4, "trained": [1, "ä"]}
+HEADER = {"method": "fusion-sr", "settings": {"fusion": "add"}, "scale": 4, "trained": [1, "ä"]}
 
 
 def block(*, rngs):
@@ -216,17 +216,17 @@ def test_the_header_of_published_weights_builds_their_network(tmp_path, make, ar
     assert header == json.loads(json.dumps(told))
     assert (header["method"], header["scale"], header["jaxsr"]) == ("fusion-sr", 2, jaxsr.__version__)
     assert header["source"]["file"] == "a.npz"
-    assert {k: header["arguments"][k] for k in ("color", "start", "unjitter")} == {
+    assert {k: header["settings"][k] for k in ("demodulated", "base", "unjitter")} == {
         "demodulated": False,
         "base": "none",
         "unjitter": False,
     }
-    method = build(header["method"], header["arguments"])
+    method = build(header["method"], header["settings"])
     net = nnx.eval_shape(lambda: method.network.new(nnx.Rngs(0)))
     assert isinstance(net, make)
     into(nnx.state(net), arrays, out)
     for key, value in arguments.items():
-        assert method.network.settings[key] == value
+        assert method.network.settings[key] == (list(value) if isinstance(value, tuple) else value)
 
 
 @pytest.mark.parametrize(
@@ -246,11 +246,8 @@ def test_names_and_shapes_of_published_weights_tell_all(tmp_path, capsys, make, 
     assert status == 0
     assert f"{method}, scale {arguments['scale']}" in told
     arrays, header = load_weights(out)
-    assert (header["method"], header["arguments"], header["scale"]) == (
-        method,
-        arguments,
-        arguments["scale"],
-    )
+    assert (header["method"], header["format"], header["scale"]) == (method, 2, arguments["scale"])
+    assert header["settings"] == arguments | {"unjitter": True, "dtype": "float32"}
     into(nnx.state(abstract(make, **arguments)), arrays, out)
     assert (
         find_method(str(out), arguments["scale"]).method.network.settings["features"] == arguments["features"]
@@ -309,7 +306,7 @@ def converted(source, out):
     """Our network with published weights, by way of `jaxsr convert-weights`: compiled, and its state."""
     convert_published(source, out)
     arrays, header = load_weights(out)
-    new_net = build(header["method"], header["arguments"]).network.new
+    new_net = build(header["method"], header["settings"]).network.new
     graph, state = nnx.split(nnx.eval_shape(lambda: new_net(nnx.Rngs(0))))
     net = nnx.merge(graph, into(state, arrays, out))
     net.eval()
@@ -629,5 +626,5 @@ def test_the_buffers_of_a_smaller_network_must_be_said(tmp_path, capsys):
     out = tmp_path / "out.safetensors"
     status, told, _ = run(capsys, "convert-weights", source, out, "--buffers", "depth", "normal", "--half")
     assert status == 0
-    assert load_weights(out)[1]["arguments"]["buffers"] == ["depth", "normal"]
+    assert load_weights(out)[1]["settings"]["buffers"] == ["depth", "normal"]
     assert "normal" in told
