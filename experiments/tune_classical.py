@@ -169,7 +169,7 @@ def coordinate_search(
 def tune_taau(sequences: Sequence[FrameSequence], rounds: int) -> dict[str, Any]:
     clips: list[Clip] = [
         (
-            [jax.device_put(f) for f in observed(s, scale)],
+            [jax.device_put(f) for f in observed(s, METHODS["guided-taau"], scale)],
             jnp.stack([jnp.asarray(s.truth(i)) for i in range(len(s))]),
             s.exposure,
         )

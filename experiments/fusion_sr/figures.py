@@ -76,7 +76,9 @@ def columns(sequence: FrameSequence, methods: Sequence[LoadedMethod], scale: int
     found = [Shown("input", given.repeat(scale, 0).repeat(scale, 1), {})]
     for ready in methods:
         check_needs(ready.method, sequence, scale)
-        frames = (seen for seen, _ in zip(observed(sequence, scale), range(frame), strict=False))
+        frames = (
+            seen for seen, _ in zip(observed(sequence, ready.method, scale), range(frame), strict=False)
+        )
         for made in stream(ready.method, frames, ready.net):
             image = display(made.image, sequence.exposure)
         found.append(Shown(ready.method.name, image, measure_frame(image, truth, keys=keys)["all"]))

@@ -3,7 +3,8 @@
 The truth, and the colour of frames that are to be extrapolated, are never handed over.
 """
 
-from collections.abc import Iterator
+import functools
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -29,14 +30,19 @@ def rendered_schedule(sequence: Sequence, every: int) -> list[bool]:
     return rendered
 
 
-def observed(sequence: Sequence, method: Method, scale: int, every: int = 1) -> Iterator[Frame]:
-    """The frames as a method may see them, with the buffers that it needs; read ahead in a thread."""
+def readers(sequence: Sequence, method: Method, scale: int, every: int = 1) -> list[Callable[[], Frame]]:
+    """One function per frame, which reads it as the method may see it: with the buffers that it needs."""
     schedule = rendered_schedule(sequence, every)
     needs = {rendered: method.needs.of(rendered, not all(schedule)) for rendered in (True, False)}
-    return prefetch(
-        sequence.frame(i, scale, rendered=rendered, needs=needs[rendered])
+    return [
+        functools.partial(sequence.frame, i, scale, rendered=rendered, needs=needs[rendered])
         for i, rendered in enumerate(schedule)
-    )
+    ]
+
+
+def observed(sequence: Sequence, method: Method, scale: int, every: int = 1) -> Iterator[Frame]:
+    """The frames as a method may see them, read ahead in a thread."""
+    return prefetch(read() for read in readers(sequence, method, scale, every))
 
 
 def available(sequence: Sequence, scale: int) -> frozenset[str]:

@@ -18,12 +18,13 @@ from jaxsr.frames import Frame
 from jaxsr.io.exr import write_exr
 from jaxsr.io.images import write_png
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.methods import Method
 from jaxsr.ops import to_display
 from jaxsr.progress import Advance
 from jaxsr.runtime.cost import Cost, Timing
 from jaxsr.runtime.load import LoadedMethod
 from jaxsr.runtime.record import claim_folder, describe_run, frame_path
-from jaxsr.runtime.schedule import check_needs, rendered_schedule
+from jaxsr.runtime.schedule import check_needs, readers, rendered_schedule
 from jaxsr.runtime.stream import stream
 
 TOGETHER = 4
@@ -62,22 +63,19 @@ def display(color_linear: np.ndarray, exposure: float) -> np.ndarray:
     return np.asarray(to_display(np.ascontiguousarray(color_linear), exposure))
 
 
-def frames_in_memory(
-    sequence: FrameSequence, scale: int, every: int = 1, needs: frozenset[str] | None = None
-) -> Iterator[Frame]:
+def frames_in_memory(sequence: FrameSequence, method: Method, scale: int, every: int = 1) -> Iterator[Frame]:
     """The frames as a method may see them; no thread runs while the caller works on one.
 
     Threads decode the next `TOGETHER` frames, and rest before the first of these is given.
 
     Args:
+        method: it says which buffers are read.
         scale, every: as for `upscale`.
-        needs: the buffers to read, see `Sequence.frame`; by default all.
     """
-    schedule = rendered_schedule(sequence, every)
+    reads = readers(sequence, method, scale, every)
     with ThreadPoolExecutor(TOGETHER) as pool:
-        for first in range(0, len(schedule), TOGETHER):
-            together = range(first, min(first + TOGETHER, len(schedule)))
-            read = [pool.submit(sequence.frame, i, scale, schedule[i], needs) for i in together]
+        for first in range(0, len(reads), TOGETHER):
+            read = [pool.submit(each) for each in reads[first : first + TOGETHER]]
             wait(read)
             while read:
                 yield read.pop(0).result()  # an error arrives where its frame would have been
@@ -87,7 +85,7 @@ def write_frames(
     sequence: FrameSequence, loaded: LoadedMethod, out: Path, scale: int, every: int
 ) -> Iterator[MadeFrame]:
     """Make all frames of a sequence; each is on disk when it is given."""
-    frames = stream(loaded.method, frames_in_memory(sequence, scale, every), loaded.net)
+    frames = stream(loaded.method, frames_in_memory(sequence, loaded.method, scale, every), loaded.net)
     for i, (info, made) in enumerate(zip(sequence.infos, frames, strict=True)):
         half = np.clip(made.image, 0, np.finfo(np.float16).max).astype(np.float16)
         channels = {f"color.{c}": half[..., k] for k, c in enumerate("RGB")}

@@ -9,6 +9,7 @@ import pytest
 
 from jaxsr.errors import JaxsrError
 from jaxsr.io.images import read_color, read_png
+from jaxsr.methods import METHODS
 from jaxsr.ops import to_display
 from jaxsr.runtime.load import find_method
 from jaxsr.runtime.record import SUFFIXES, claim_folder, describe_run, read_run
@@ -111,7 +112,7 @@ def test_no_thread_decodes_while_a_frame_is_used(monkeypatch, tmp_path):
         return made
 
     monkeypatch.setattr(sequence, "frame", frame)
-    busy = [len(reading) for _ in frames_in_memory(sequence, 2)]
+    busy = [len(reading) for _ in frames_in_memory(sequence, METHODS["guided"], 2)]
     assert busy == [0] * (TOGETHER + 2)
 
 
