@@ -1,6 +1,5 @@
 """A method of your own, trained and compared: `python experiments/examples/add_a_method.py --steps 150`."""
 
-from dataclasses import make_dataclass
 from pathlib import Path
 
 import jax
@@ -11,8 +10,7 @@ from flax import nnx
 from jaxsr.data.sample import unpack_sample
 from jaxsr.evaluation.evaluate import evaluate
 from jaxsr.evaluation.running import Settings
-from jaxsr.methods import LEARNED, Learned, Method, Needs, Network
-from jaxsr.methods.base import module_maker
+from jaxsr.methods import LEARNED, Learned, Method, Needs, Network, NoOptions, last_frames, module_maker
 from jaxsr.methods.history import no_image
 from jaxsr.ops import from_display, sample_jittered, to_display
 from jaxsr.progress import Bars
@@ -32,11 +30,8 @@ class Net(nnx.Module):
 
 
 def loss(net, window):  # of a batch of windows; here their last frames are all there is
-    frames, truth = jax.tree.map(lambda x: x[:, -1], window)
+    frames, truth = last_frames(window)
     return jnp.mean(jnp.abs(jax.vmap(net)(frames) - jax.vmap(to_display)(truth, frames.exposure))), {}
-
-
-module = module_maker(Net)
 
 
 def upscale(net, state, frame):  # a rendered frame; `state` goes from frame to frame
@@ -44,14 +39,11 @@ def upscale(net, state, frame):  # a rendered frame; `state` goes from frame to 
     return image, image
 
 
-def extrapolate(net, state, frame):  # a frame that was not rendered: the last one again
-    return state, state
-
-
+module = module_maker(Net)
 NEEDS = Needs(frozenset({"lr.color", "hr.base_color", "hr.normal"}))
-MINE = Method("mine", "a network", NEEDS, no_image, upscale, extrapolate, Network(Net, loss))
-NONE = make_dataclass("Options", [])
-LEARNED["mine"] = Learned(NONE, NONE, lambda *_: MINE)  # how its weights find it
+HOLD = lambda net, state, frame: (state, state)  # noqa: E731 (a frame that was not rendered)
+MINE = Method("mine", "a network", NEEDS, no_image, upscale, HOLD, Network(Net, loss))
+LEARNED["mine"] = Learned(NoOptions, NoOptions, lambda *_: MINE)  # how its weights find it
 
 
 def main(steps: int = 150, out: Path = Path("example")) -> None:

@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 
 from jaxsr.errors import JaxsrError
 from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, nsrr, rcan, rrn, taau
-from jaxsr.methods.base import Method, Needs, Network, Windows
+from jaxsr.methods.base import Method, Needs, Network, Windows, last_frames, module_maker
 from jaxsr.methods.image_loss import ImageLoss, L1Loss
-from jaxsr.methods.options import from_json, to_json
+from jaxsr.methods.options import NoOptions, from_json, to_json
 
 
 class Learned(NamedTuple):
@@ -82,9 +82,12 @@ __all__ = [
     "Method",
     "Needs",
     "Network",
+    "NoOptions",
     "Windows",
     "build",
     "from_json",
+    "last_frames",
+    "module_maker",
     "to_json",
     "variant",
 ]

@@ -17,6 +17,11 @@ MAX_COUNT = 4096
 """No number of channels, blocks or frames is larger: a file could else ask for a network without end."""
 
 
+@dataclasses.dataclass(frozen=True)
+class NoOptions:
+    """The settings of a method, or of its loss, that has none."""
+
+
 def check_options(options: Any) -> None:
     """See that each field of a dataclass of options has a value of its type.
 

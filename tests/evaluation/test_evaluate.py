@@ -345,7 +345,7 @@ def spoilt(tmp_path, name):
     ("name", "words", "options"),
     [
         ("no truth", "frame 2 has no truth.*jaxsr upscale", {}),
-        ("no normal", "'guided' needs hr.normal", {}),
+        ("no normal", "'guided' needs hr.normal", {"every": 2}),
         ("NaN in the truth", "0002.*NaN", {}),
         ("too short", "no frame is left to measure; expected a number from 0 to 2; found 3", {"warmup": 3}),
         ("negative", "no frame is left to measure", {"warmup": -1}),
@@ -426,8 +426,8 @@ SCRIPT = """
 import jax.numpy as jnp
 from jaxsr.methods import METHODS
 
-def step(net, state, frame):
-    state, image = METHODS["nearest"].step(net, state, frame)
+def upscale(net, state, frame):
+    state, image = METHODS["nearest"].upscale(net, state, frame)
     return state, image * GAIN
 
 GAIN = {gain}
@@ -442,11 +442,11 @@ def mine(monkeypatch, path, gain, closed=1.0):
     exec(compile(path.read_text(), path, "exec"), module.__dict__)
     monkeypatch.setitem(sys.modules, "my_script", module)
 
-    def step(net, state, frame):
-        state, image = module.step(net, state, frame)
+    def upscale(net, state, frame):
+        state, image = module.upscale(net, state, frame)
         return state, image * closed
 
-    monkeypatch.setitem(METHODS, "mine", METHODS["nearest"]._replace(name="mine", step=step))
+    monkeypatch.setitem(METHODS, "mine", METHODS["nearest"]._replace(name="mine", upscale=upscale))
 
 
 def test_the_code_of_a_method_of_ones_own_counts(data, tmp_path, monkeypatch, counted):
@@ -469,11 +469,11 @@ def test_the_code_of_a_method_of_ones_own_counts(data, tmp_path, monkeypatch, co
 def test_a_method_whose_content_is_unknown_is_not_kept(data, tmp_path, monkeypatch, counted):
     lock = threading.Lock()
 
-    def step(net, state, frame):
+    def upscale(net, state, frame):
         with lock:
-            return METHODS["nearest"].step(net, state, frame)
+            return METHODS["nearest"].upscale(net, state, frame)
 
-    monkeypatch.setitem(METHODS, "mine", METHODS["nearest"]._replace(name="mine", step=step))
+    monkeypatch.setitem(METHODS, "mine", METHODS["nearest"]._replace(name="mine", upscale=upscale))
     for _ in range(2):
         with pytest.warns(UserWarning, match=r"results of 'mine' are not kept.*_thread.lock"):
             run([data / "set" / "one"], ["mine"], tmp_path / "out", SETTINGS._replace(metrics=("psnr",)))

@@ -83,7 +83,7 @@ def test_a_variant_is_the_network_that_its_label_says(name):
         word for word in ("depth", "base-color", "normal", "roughness", "metallic") if f"no-{word}" == name
     }
     if seen:
-        assert not {f"hr.{word.replace('-', '_')}" for word in seen} & method.needs.of(True)
+        assert not {f"hr.{word.replace('-', '_')}" for word in seen} & method.needs.rendered
     loss = method.network.loss_settings
     assert (loss["ssim_weight"], loss["l1_weight"], loss["perceptual_weight"]) == (1, 1, 0)
     assert method.network.windows.length == 5

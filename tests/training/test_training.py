@@ -20,7 +20,8 @@ from flax import nnx
 from jaxsr.data.loader import make_loader
 from jaxsr.errors import JaxsrError
 from jaxsr.io.images import read_png
-from jaxsr.methods import build, fusion_sr
+from jaxsr.methods import fusion_sr, variant
+from jaxsr.methods.image_loss import ImageLoss
 from jaxsr.progress import Bar
 from jaxsr.training import TrainConfig, loop
 from jaxsr.training import train as train_method
@@ -156,7 +157,7 @@ def test_killed_at_any_moment(data, tmp_path):
     assert_same(one, many)
 
 
-FUSION_SR = fusion_sr.method(fusion_sr.Options(perceptual_weight=0.0))
+FUSION_SR = fusion_sr.method(loss=ImageLoss(perceptual_weight=0.0))
 
 
 @pytest.mark.parametrize(
@@ -164,7 +165,7 @@ FUSION_SR = fusion_sr.method(fusion_sr.Options(perceptual_weight=0.0))
     [
         pytest.param(tiny_method.method(), id="tiny"),
         pytest.param(FUSION_SR, id="fusion-sr", marks=pytest.mark.slow),
-        *(pytest.param(build(name, SMALL[name] | {"scale": 2}), id=name) for name in SMALL),
+        *(pytest.param(variant(name, SMALL[name] | {"scale": 2}), id=name) for name in SMALL),
     ],
 )
 def test_two_devices_train_as_one(data, method):
