@@ -46,7 +46,13 @@ from jaxsr.nets import FusionSR, UNetSR
 from jaxsr.nets.blocks import count_channels
 from jaxsr.ops import from_display, to_display
 from jaxsr.ops.color import WHITE
-from jaxsr.ops.encoding import compress_lighting, expand_lighting, normalized_depth, sample_offset
+from jaxsr.ops.encoding import (
+    DEPTH_OCTAVES,
+    compress_lighting,
+    expand_lighting,
+    normalized_depth,
+    sample_offset,
+)
 
 BUFFERS = ("depth", "base_color", "normal", "roughness", "metallic")
 """In the order of the network's channels."""
@@ -76,6 +82,8 @@ class Options:
     """Type of the convolutions; parameters and losses are float32."""
     eps: float = 0.02
     """Smallest base colour that the colour of a surface is divided by."""
+    depth_octaves: float = DEPTH_OCTAVES
+    """Ratio of depths, in octaves, that the network tells apart."""
     estimate: guided_taau.Options = guided_taau.Options()  # noqa: RUF009 (frozen)
     """Constants of the guided upsampling that `base="guided"` corrects."""
     reprojection: guided.Options = guided.Options()  # noqa: RUF009 (frozen)
@@ -88,8 +96,9 @@ class Options:
         self.reprojection.check()
         if unknown := [name for name in self.buffers if name not in BUFFERS]:
             raise JaxsrError(f"unknown buffer {unknown[0]!r}", where="buffers", expected=", ".join(BUFFERS))
-        if not self.eps > 0:
-            raise JaxsrError("bad eps", where="eps", expected="a number above 0", found=self.eps)
+        for name in ("eps", "depth_octaves"):
+            if not (value := getattr(self, name)) > 0:
+                raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=value)
         count_channels(self.buffers)
 
     def needs(self) -> frozenset[str]:
@@ -102,12 +111,14 @@ class Options:
         return frozenset(needs)
 
 
-def gbuffer_input(gbuffer: GBuffer, buffers: tuple[str, ...]) -> Float[Array, "*b H W c"]:
-    """I_G: the buffers of these names, normalised, as channels."""
+def gbuffer_input(
+    gbuffer: GBuffer, buffers: tuple[str, ...], octaves: float = DEPTH_OCTAVES
+) -> Float[Array, "*b H W c"]:
+    """I_G: the buffers of these names, normalised, as channels; `octaves` is for `normalized_depth`."""
     channels = []
     for name in buffers:
         if name == "depth":
-            channels.append(normalized_depth(gbuffer.depth_linear))
+            channels.append(normalized_depth(gbuffer.depth_linear, octaves))
         else:
             value = getattr(gbuffer, name)
             assert value is not None  # the needs of the method promise it
@@ -134,7 +145,7 @@ def base_image(frame: Frame, options: Options) -> Float[Array, "H W 3"]:
 def network_output(net: Callable[..., Array], frames: Frame, options: Options) -> Float[Array, "b H W 3"]:
     """A batch of frames through the network: lighting as `compress_lighting` makes it, or display colour."""
     offset = sample_offset(frames.jitter_px, frames.scale) if options.unjitter else None
-    gbuffer = gbuffer_input(frames.hr, options.buffers)
+    gbuffer = gbuffer_input(frames.hr, options.buffers, options.depth_octaves)
     if options.base == "none":
         return net(color_input(frames, options), gbuffer, offset)
     base = jax.lax.stop_gradient(jax.vmap(lambda frame: base_image(frame, options))(frames))

@@ -13,6 +13,7 @@ _RENAMED = {"follow_jitter": "unjitter", "compute": "dtype"}
 
 _FILTERS: dict[str, Any] = {
     "eps": 0.02,
+    "depth_octaves": 16.0,
     "estimate": {
         "sigma_guide": 0.3,
         "depth_tolerance": 0.05,
@@ -59,7 +60,7 @@ _DEFAULTS: dict[str, dict[str, Any]] = {
         "reduction": 16,
     },
     "rrn": {"scale": 4, "unjitter": True, "dtype": "float32", "blocks": 10, "features": 128},
-    "nsrr": {"previous": 4, "dtype": "float32"},
+    "nsrr": {"previous": 4, "dtype": "float32", "depth_octaves": 16.0},
 }
 
 

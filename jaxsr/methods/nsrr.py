@@ -36,7 +36,7 @@ from jaxsr.methods.options import check_options, to_json
 from jaxsr.nets import NSRR
 from jaxsr.nets.nsrr import CHANNELS
 from jaxsr.ops import compose_motion, from_display, to_display, warp_zero_upsampled, zero_upsample
-from jaxsr.ops.encoding import normalized_depth, sample_offset
+from jaxsr.ops.encoding import DEPTH_OCTAVES, normalized_depth, sample_offset
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,8 @@ class Options:
     """Rendered frames before the current one that the network sees."""
     dtype: Literal["float32", "bfloat16"] = "float32"
     """Type of the convolutions and of the history; parameters and losses are float32."""
+    depth_octaves: float = DEPTH_OCTAVES
+    """Ratio of depths, in octaves, that the network tells apart."""
 
 
 class Previous(NamedTuple):
@@ -67,21 +69,26 @@ class State(NamedTuple):
     last: History
 
 
-def rgbd_input(frame: Frame) -> Float[Array, "*b h w 4"]:
-    """x: what the network sees of a frame."""
-    return jnp.concatenate([to_display(frame.exposed), normalized_depth(frame.lr.depth_linear)], -1)
+def rgbd_input(frame: Frame, octaves: float = DEPTH_OCTAVES) -> Float[Array, "*b h w 4"]:
+    """x: what the network sees of a frame; `octaves` is for `normalized_depth`."""
+    depth = normalized_depth(frame.lr.depth_linear, octaves)
+    return jnp.concatenate([to_display(frame.exposed), depth], -1)
 
 
-def displayed(net: NSRR, frames: Frame, previous: Previous) -> Float[Array, "b H W 3"]:
+def displayed(
+    net: NSRR, frames: Frame, previous: Previous, octaves: float = DEPTH_OCTAVES
+) -> Float[Array, "b H W 3"]:
     """A batch of frames through the network: HR colour, display-referred, not clipped.
 
     Args:
         net: the network.
         frames: the current frames.
         previous: the frames before, with motion that begins in the current ones.
+        octaves: see `rgbd_input`.
     """
     scale, motion = frames.scale, previous.motion_px
-    current = zero_upsample(net.features(rgbd_input(frames)), scale, sample_offset(frames.jitter_px, scale))
+    features = net.features(rgbd_input(frames, octaves))
+    current = zero_upsample(features, scale, sample_offset(frames.jitter_px, scale))
     paths = jnp.moveaxis(motion.reshape(*motion.shape[:-1], -1, 2), -2, 1)
     warped = warp_zero_upsampled(previous.features, paths, scale, previous.offset)
     return net.reconstruct(current, warped)
@@ -92,10 +99,10 @@ def with_own_path(motion_px: Float[Array, "*b H W c"]) -> Float[Array, "*b H W c
     return jnp.concatenate([jnp.zeros_like(motion_px, shape=(*motion_px.shape[:-1], 2)), motion_px], -1)
 
 
-def previous_of(net: NSRR, frames: Frame) -> Previous:
+def previous_of(net: NSRR, frames: Frame, octaves: float = DEPTH_OCTAVES) -> Previous:
     """What the last frame of each window, [B, T], sees of the others; no reset follows the first frame."""
     before = jax.tree.map(lambda x: x[:, -2::-1], frames)
-    rgbd = rgbd_input(before)
+    rgbd = rgbd_input(before, octaves)
     features = net.previous_features(rgbd.reshape(-1, *rgbd.shape[2:]))
     motion = frames.hr.motion_px
     paths = motion[:, 0, :, :, :0]
@@ -121,7 +128,9 @@ def method(options: Options | None = None, loss: ImageLoss | None = None) -> Met
     check_loss(weights)
     if o.previous < 1:
         raise JaxsrError("bad previous", where="previous", expected="a whole number from 1", found=o.previous)
-    dtype = jnp.dtype(o.dtype)
+    if not o.depth_octaves > 0:
+        raise JaxsrError("bad depth_octaves", where="depth_octaves", expected="a number above 0", found=0)
+    dtype, octaves = jnp.dtype(o.dtype), o.depth_octaves
 
     def new(rngs: nnx.Rngs) -> NSRR:
         return NSRR(previous=o.previous, dtype=dtype, rngs=rngs)
@@ -129,7 +138,7 @@ def method(options: Options | None = None, loss: ImageLoss | None = None) -> Met
     def loss_of(net: nnx.Module, window: Window) -> tuple[Array, dict[str, Array]]:
         assert isinstance(net, NSRR)
         now, truth = last_frames(window)
-        shown = displayed(net, now, previous_of(net, window.frames))
+        shown = displayed(net, now, previous_of(net, window.frames, octaves), octaves)
         return image_loss(shown, to_display(truth * now.exposure[..., None, None, None]), weights)
 
     module, warp = module_maker(new), plain_warp()
@@ -151,9 +160,9 @@ def method(options: Options | None = None, loss: ImageLoss | None = None) -> Met
             return State(state.previous, warp.keep(frame.color_linear, frame)), frame.color_linear
         model, before = module(net), seen_from(frame, state.previous)
         one, past = one_image((frame, before))
-        shown = displayed(model, one, past)[0].astype(frame.color_linear.dtype)
+        shown = displayed(model, one, past, octaves)[0].astype(frame.color_linear.dtype)
         image = from_display(jnp.clip(shown, 0, 1)) / frame.exposure
-        features = model.previous_features(rgbd_input(one))
+        features = model.previous_features(rgbd_input(one, octaves))
         offset = sample_offset(one.jitter_px, frame.scale)
         previous = Previous(
             jnp.concatenate([features, before.features[:-1]]),

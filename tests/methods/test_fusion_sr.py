@@ -187,6 +187,28 @@ def test_channels_are_in_order():
     assert everything.max() <= 1
 
 
+def test_a_prediction_that_is_too_bright_can_come_down():
+    """Beyond white the picture does not change any more, but the slope of what the loss sees is positive."""
+    options = Options(base="none")
+    frame = jax.tree.map(lambda x: x[None], frame_at(0)[0])
+
+    def shown(output):
+        made, linear = displayed(lambda *_: output, frame, options)
+        return made, to_display(linear * frame.exposure[..., None, None, None])
+
+    output = jnp.broadcast_to(jnp.linspace(0, 1.2, SIZE[0])[None, None, :, None], (1, *SIZE[::-1], 3))
+    made, expected = shown(output)
+    np.testing.assert_allclose(made, expected, atol=1e-5)  # values are those of the picture
+    slope = np.asarray(jax.grad(lambda x: jnp.sum(shown(x)[0]))(output))
+    white = np.asarray(expected) > 0.9999
+    assert white.mean() > 0.1
+    np.testing.assert_allclose(slope[white & (np.asarray(output) > 1)], 0.1, rtol=1e-4)
+    assert (slope[white] >= 0).all()
+    dark = jax.tree.map(lambda x: jnp.full_like(x, 0.2), expected)
+    pull = jax.grad(lambda x: jnp.mean(jnp.abs(shown(x)[0] - dark)))(jnp.full_like(output, 1.1))
+    assert (np.asarray(pull) > 0).all()  # a step against it makes the prediction darker
+
+
 # Where LR samples go.
 
 
@@ -369,6 +391,7 @@ def test_the_paper_s_form_has_the_paper_s_size(architecture, count):
             r"base: bad base; expected none \| guided; found hdr",
         ),
         ({"demodulated": "lighting"}, "demodulated: bad demodulated; expected true or false; found lighting"),
+        ({"depth_octaves": 0.0}, "depth_octaves: bad depth_octaves; expected a number above 0"),
         ({"eps": 0.0}, "eps: bad eps; expected a number above 0; found 0"),
         ({"fusion": "product"}, "fusion"),
         ({"architecture": "gan"}, "architecture"),

@@ -465,6 +465,7 @@ def test_settings_in_json_build_the_same_method(name):
         ({"previous": 0}, "previous: bad previous; expected a whole number from 1; found 0"),
         ({"previous": 1.5}, "previous: bad previous; expected a whole number from 0 to 4096; found 1.5"),
         ({"dtype": "float16"}, "dtype"),
+        ({"depth_octaves": 0.0}, "depth_octaves: bad depth_octaves; expected a number above 0"),
         ({"perceptual_weight": -1.0}, "perceptual_weight"),
     ],
 )

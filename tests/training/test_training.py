@@ -273,13 +273,16 @@ def test_fine_tuning_at_another_scale(whole, data, tmp_path):
 
 def test_weights_of_other_options_are_noted(data, tmp_path, capsys):
     """Shapes can fit where the meaning does not."""
-    old = tiny_method.method()._replace(arguments={"demodulated": False, "buffers": ["depth"], "gone": 1})
-    new = old._replace(arguments={"color": "lighting", "buffers": ("depth",)})
+    tiny = tiny_method.method()
+    settings = {"demodulated": False, "buffers": ["depth"], "gone": 1}
+    old = tiny._replace(network=tiny.network._replace(settings=settings))
+    settings = {"demodulated": True, "buffers": ["depth"]}
+    new = tiny._replace(network=tiny.network._replace(settings=settings))
     config = TrainConfig(data=(data,), out=tmp_path / "old", cache=data.parent / "cache", scale=2, crop=16)
     config = dataclasses.replace(config, steps=1, batch=2)
     file = train_method(old, config, quiet=True)
     train_method(new, dataclasses.replace(config, out=tmp_path / "new", init=file))
-    assert "weights.safetensors was made with other options: color display -> lighting\n" in (
+    assert "weights.safetensors was made with other options: demodulated False -> True\n" in (
         capsys.readouterr().err
     )
 
