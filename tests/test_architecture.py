@@ -6,7 +6,7 @@ from pathlib import Path
 import jaxsr
 
 PACKAGE = Path(jaxsr.__file__).parent
-GROUND = {"errors", "files", "progress", "provenance", "layers", "frames"}
+GROUND = {"errors", "files", "progress", "provenance", "layers", "frames", "srgb"}
 """What everything above `ops` may import."""
 BELOW = {
     "errors": set(),
@@ -15,7 +15,8 @@ BELOW = {
     "provenance": {"errors", "files"},
     "layers": {"errors"},
     "frames": {"errors", "layers"},
-    "ops": {"errors", "frames", "layers"},
+    "srgb": set(),
+    "ops": {"errors", "frames", "layers", "srgb"},
     "nets": {"ops", *GROUND},
     "losses": {"nets", "ops", *GROUND},
     "metrics": {"losses", "nets", "ops", *GROUND},

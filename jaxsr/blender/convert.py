@@ -12,8 +12,8 @@ from jaxtyping import Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera
-from jaxsr.io.geometry import image_plane, to_pixels
 from jaxsr.io.writing import HALF_MAX
+from jaxsr.ops.pinhole import BEHIND_PX, still_motion
 
 SKY_DEPTH = 1e9
 """Blender writes 1e10 where a ray hits nothing."""
@@ -49,13 +49,9 @@ def sky_motion(
     Returns:
         `motion_px` in pixels of this image. Zero where the direction lay behind the previous camera.
     """
-    p, xy = image_plane(size, camera, jitter_px)
-    direction = np.concatenate([xy, np.ones((*xy.shape[:2], 1))], -1)
-    rotation = np.asarray(previous.world_from_view)[:3, :3].T @ np.asarray(camera.world_from_view)[:3, :3]
-    before = direction @ rotation.T
-    ahead = before[..., 2:] > 1e-6
-    z = np.where(ahead, before[..., 2:], 1.0)
-    return np.where(ahead, p - to_pixels(before[..., :2], z, previous, size), 0.0)
+    sky = np.full((size[1], size[0], 1), np.inf)
+    motion = still_motion(sky, camera, previous, jitter_px, np)
+    return np.where(motion < -BEHIND_PX / 2, motion, 0.0)  # it is about -BEHIND_PX where there was no pixel
 
 
 def convert_color(raw: Mapping[str, np.ndarray]) -> Float[np.ndarray, "h w 3"]:

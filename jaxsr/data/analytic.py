@@ -14,6 +14,7 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, Frame, GBuffer, Scale
+from jaxsr.ops.pinhole import pixels_from_world, rotate, unjittered_positions, view_rays
 
 _SUN = np.array([0.45, -0.55, 0.70]) / np.linalg.norm([0.45, -0.55, 0.70])
 
@@ -193,8 +194,9 @@ def render(
     view, before = camera(time, size, still=still), camera(time - 1, size, still=still)
     now, then = (0.0, 0.0) if frozen else (time, time - 1)
     w, h = size
-    x, y = np.meshgrid(np.arange(w) + jitter_px[0], np.arange(h) + jitter_px[1])
-    origin, rays = _rays(view, x, y, size)
+    pixels = unjittered_positions((h, w), jitter_px, np.float64, np)
+    origin: Any = view.world_from_view[:3, 3]
+    rays = rotate(view.world_from_view[:3, :3], view_rays(pixels, view, (h, w), np), np)
     objects = scene()
     distance, index = _nearest(objects, origin, rays, now)
     hit = index >= 0
@@ -214,20 +216,20 @@ def render(
     color = _shade(objects, points, rays, normal, base, roughness, metallic, hit, now)
     # Sky is infinitely far: only the rotation of the camera moves it.
     past = np.where(hit[..., None], past, before.world_from_view[:3, 3] + rays * 1e9)
-    position_before, depth_before = _project(before, past, size)
-    position_now, depth_now = _project(view, np.where(hit[..., None], points, origin + rays * 1e9), size)
+    position_before, depth_before = pixels_from_world(past, before, (h, w), np)
+    there = np.where(hit[..., None], points, origin + rays * 1e9)
+    position_now, depth_now = pixels_from_world(there, view, (h, w), np)
     motion = position_now - position_before
 
-    inside = np.all((position_before > -0.5) & (position_before < np.array([w, h]) - 0.5), -1) & (
-        depth_before > 0
-    )
+    inside = np.all((position_before > -0.5) & (position_before < np.array([w, h]) - 0.5), -1)
+    inside &= depth_before[..., 0] > 0
     back_origin: Any = before.world_from_view[:3, 3]
     back_rays = np.where(hit[..., None], past - back_origin, rays)
     back_distance, _ = _nearest(objects, back_origin, back_rays, then)
     visible = inside & np.where(hit, back_distance > 1 - 1e-4, ~np.isfinite(back_distance))
     layers = {
         "color": color,
-        "depth": np.where(hit, depth_now, np.inf)[..., None],
+        "depth": np.where(hit[..., None], depth_now, np.inf),
         "motion": motion,
         "normal": normal,
         "base_color": base,
@@ -301,22 +303,6 @@ def frame(
 def _rotation_z(angle: float) -> np.ndarray:
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _rays(view: Camera, x: np.ndarray, y: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Eye `[3]` and world-space rays `[..., 3]` of unit view depth through pixels x, y `[...]`."""
-    ndc = np.stack([(x + 0.5) / size[0], (y + 0.5) / size[1]], -1) * 2 - 1
-    xy = (ndc + view.lens_shift) * view.tan_half_fov
-    rays = np.concatenate([xy, np.ones_like(xy[..., :1])], -1) @ np.asarray(view.world_from_view)[:3, :3].T
-    return np.asarray(view.world_from_view)[:3, 3], rays
-
-
-def _project(view: Camera, points: np.ndarray, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels `[..., 2]` and view depth `[...]` of world points `[..., 3]`."""
-    matrix = np.asarray(view.world_from_view)
-    local = (points - matrix[:3, 3]) @ matrix[:3, :3]
-    ndc = local[..., :2] / (local[..., 2:] * view.tan_half_fov) - view.lens_shift
-    return (ndc + 1) / 2 * np.array(size) - 0.5, local[..., 2]
 
 
 def _nearest(

@@ -13,8 +13,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from jaxsr.io.geometry import image_plane, to_pixels, world_position
 from jaxsr.io.writing import FrameInfo
+from jaxsr.ops.pinhole import still_motion, unjittered_positions, view_rays, world_from_depth
 
 Layers = Mapping[str, np.ndarray]
 Size = tuple[int, int]
@@ -178,19 +178,8 @@ def motion_evidence(
 
 def static_motion(depth: np.ndarray, info: FrameInfo, info_previous: FrameInfo) -> np.ndarray:
     """`[h, w, 2]`: backward motion, in pixels, of points that stand still; 0 for sky."""
-    h, w = depth.shape[:2]
-    finite = np.where(is_sky(depth), np.inf, depth)
-    grid, _ = image_plane((w, h), info)
-    back, _ = project(world_position(finite, info).astype(np.float64), info_previous, (w, h))
-    return np.where(is_sky(depth), 0, grid - back)
-
-
-def project(points: np.ndarray, info: FrameInfo, size: Size) -> tuple[np.ndarray, np.ndarray]:
-    """World points `[..., 3]` to pixels `[..., 2]` and view depth `[...]`."""
-    matrix = np.asarray(info.world_from_view, np.float64)
-    local = (points - matrix[:3, 3]) @ np.linalg.pinv(matrix[:3, :3]).T
-    z = np.where(np.abs(local[..., 2:]) < 1e-9, 1e-9, local[..., 2:])
-    return to_pixels(local[..., :2], z, info, size), local[..., 2]
+    sky = is_sky(depth)
+    return np.where(sky, 0, still_motion(np.where(sky, np.inf, depth), info, info_previous, xnp=np))
 
 
 CAMERAS = {
@@ -223,9 +212,8 @@ def camera_evidence(
     solid = ~is_sky(depth)[..., 0]
     if not solid.any():
         return {}
-    unit = np.ones((h, w, 1), np.float32)
-    flat = replace(info, world_from_view=np.eye(4))
-    ray = np.linalg.norm(world_position(unit, flat), axis=-1, keepdims=True)
+    rays = view_rays(unjittered_positions((h, w), None, np.float64, np), info, (h, w), np)
+    ray = np.linalg.norm(rays, axis=-1, keepdims=True)
     size = float(np.median(np.linalg.norm(motion_px[solid], axis=-1)))
     out = {}
     for (camera, turn), (kind, convert) in itertools.product(CAMERAS.items(), DEPTHS.items()):
@@ -339,7 +327,7 @@ NORMALS = {
 
 def normal_evidence(depth: np.ndarray, normal: np.ndarray, info: FrameInfo) -> dict[str, float]:
     """Median angle in degrees between stored normals, read in several ways, and the surface seen in depth."""
-    position = world_position(np.where(is_sky(depth), np.inf, depth), info).astype(np.float64)
+    position = world_from_depth(np.where(is_sky(depth), np.inf, depth), info, xnp=np)
     dx, dy = position[1:-1, 2:] - position[1:-1, :-2], position[2:, 1:-1] - position[:-2, 1:-1]
     surface = np.cross(dx, dy)
     middle = np.where(is_sky(depth), np.inf, depth)[..., 0]

@@ -28,9 +28,9 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.files import parse_json
-from jaxsr.io.geometry import image_plane, to_pixels, world_position
-from jaxsr.io.images import linear_to_srgb, srgb_to_linear
 from jaxsr.io.writing import FrameInfo
+from jaxsr.ops.pinhole import pixels_from_view, unjittered_positions, view_from_world, world_from_depth
+from jaxsr.srgb import linear_from_srgb, srgb_from_linear
 
 MOTION_STEP = 64.0
 SKY_CODE = 65535
@@ -97,18 +97,21 @@ def restore_normal(code: np.ndarray, sky: np.ndarray) -> np.ndarray:
     return np.where(sky[..., None], 0, n).astype(np.float32)
 
 
-def camera_motion(
+def predicted_motion(
     depth: np.ndarray, info: FrameInfo, before: FrameInfo, jitter: tuple[float, float]
 ) -> np.ndarray:
-    """Motion of a world that stands still, from depth `[h, w]`; the sky lies far away."""
-    size = depth.shape[1], depth.shape[0]
+    """Motion of a world that stands still, from depth `[h, w]`.
+
+    Only differences from it are stored, so every step is part of the format: sky lies at 1e7, positions are
+    rounded to float32, depth before the previous camera is at least 1e-3, and motion at most 4096 pixels.
+    """
+    size = depth.shape[0], depth.shape[1]
     near = np.where(np.isfinite(depth), depth, 1e7)[..., None]
-    world = world_position(near, info, jitter).astype(np.float64)
-    matrix = np.asarray(before.world_from_view, float)
-    view = (world - matrix[:3, 3]) @ matrix[:3, :3]
-    p, _ = image_plane(size, info, jitter)
-    back = to_pixels(view[..., :2], np.maximum(view[..., 2:], 1e-3), before, size)
-    return np.clip(p - back, -4096, 4096)
+    world = world_from_depth(near, info, jitter, np).astype(np.float32)
+    view = view_from_world(world, before, np)
+    view = np.concatenate([view[..., :2], np.maximum(view[..., 2:], 1e-3)], -1)
+    here = unjittered_positions(size, jitter, np.float64, np)
+    return np.clip(here - pixels_from_view(view, before, size, np), -4096, 4096)
 
 
 # --- lossless coding of integer planes -------------------------------------------------------------------
@@ -190,14 +193,15 @@ def encode_frame(
     """All layers of one image; `before` is the frame before (or `info` again where there is none)."""
     depth, limits = quantise_depth(layers["depth"][..., 0])
     codes: dict[str, np.ndarray] = {"depth": depth[..., None]}
-    still = camera_motion(restore_depth(depth, limits), info, before, jitter)
+    still = predicted_motion(restore_depth(depth, limits), info, before, jitter)
     codes["motion"] = np.rint((layers["motion"] - still) * MOTION_STEP).astype(np.int32).view(np.uint32)
     if "color" in layers:
         codes["color"] = quantise_color(layers["color"], color_bits)
     if "normal" in layers:
         codes["normal"] = quantise_normal(layers["normal"])
     if "base_color" in layers:
-        codes["base_color"] = np.rint(linear_to_srgb(layers["base_color"]) * 255).astype(np.uint8)
+        display = srgb_from_linear(np.clip(layers["base_color"], 0, 1))
+        codes["base_color"] = np.rint(display * 255).astype(np.uint8)
     for name in ("roughness", "metallic"):
         if name in layers:
             codes[name] = np.rint(np.clip(layers[name], 0, 1) * 255).astype(np.uint8)
@@ -289,13 +293,13 @@ def _restore(
     depth = restore_depth(codes["depth"][..., 0], notes["depth"])
     layers = {"depth": depth[..., None]}
     rest = np.ascontiguousarray(codes["motion"]).view(np.int32) / MOTION_STEP
-    layers["motion"] = camera_motion(depth, info, before, jitter) + rest
+    layers["motion"] = predicted_motion(depth, info, before, jitter) + rest
     if "color" in codes:
         layers["color"] = restore_color(codes["color"], notes["color_bits"])
     if "normal" in codes:
         layers["normal"] = restore_normal(codes["normal"], ~np.isfinite(depth))
     if "base_color" in codes:
-        layers["base_color"] = srgb_to_linear(codes["base_color"] / 255)
+        layers["base_color"] = linear_from_srgb(codes["base_color"] / 255)
     for name in ("roughness", "metallic"):
         if name in codes:
             layers[name] = codes[name] / 255

@@ -14,6 +14,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path, open_file
 from jaxsr.io.exr import read_exr
 from jaxsr.io.exr_header import MAX_PIXELS
+from jaxsr.srgb import linear_from_srgb
 
 _READERS = {b"\x89PNG": PngImagePlugin.PngImageFile, b"\xff\xd8\xff": JpegImagePlugin.JpegImageFile}
 
@@ -105,7 +106,7 @@ def read_color(path: str | Path, size: tuple[int, int] | None = None) -> Float[n
     path = Path(path)
     kind = path.suffix.lower()
     if kind in (".png", ".jpg", ".jpeg"):
-        return srgb_to_linear(read_png(path, size))
+        return linear_from_srgb(read_png(path, size))
     if kind != ".exr":
         raise JaxsrError("unknown kind of picture", where=path, expected=".exr, .png or .jpg", found=kind)
     channels, _ = read_exr(path, size=size)
@@ -123,15 +124,3 @@ def read_color(path: str | Path, size: tuple[int, int] | None = None) -> Float[n
             )
         chosen = chosen[0]
     return np.stack([channels[f"{chosen}{c}"].astype(np.float32) for c in "RGB"], -1)
-
-
-def srgb_to_linear(display: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """Inverse of the sRGB transfer function (IEC 61966-2-1): linear values in [0, 1], of the same type."""
-    x = np.asarray(display)
-    return np.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
-
-
-def linear_to_srgb(linear: Float[np.ndarray, "*b"]) -> Float[np.ndarray, "*b"]:
-    """The sRGB transfer function (IEC 61966-2-1) of values clipped to [0, 1], of the same type."""
-    x = np.clip(linear, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)

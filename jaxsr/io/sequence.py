@@ -21,10 +21,10 @@ from jaxsr.files import read_json
 from jaxsr.frames import Frame, GBuffer, Scale
 from jaxsr.io.description import check_head, check_order, check_pixels, frame_info, has_hr
 from jaxsr.io.exr import read_exr, read_exr_header
-from jaxsr.io.geometry import world_position
 from jaxsr.io.writing import FrameInfo, SequenceWriter, frame_file
 from jaxsr.layers import FIELDS, LAYERS, channels, needed
 from jaxsr.ops.motion import hr_from_lr_on_host
+from jaxsr.ops.pinhole import world_from_depth
 
 __all__ = ["DERIVED", "NEEDS", "FrameInfo", "Sequence", "SequenceWriter", "prefetch"]
 
@@ -195,7 +195,8 @@ class Sequence:
                 fix="export the camera, or the layer position (docs/data.md)",
             )
         jitter = (0.0, 0.0) if resolution == "hr" else info.jitter_px
-        return world_position(self._read(i, resolution, depth, depth)["depth"], info, jitter)
+        layers = self._read(i, resolution, depth, depth)
+        return world_from_depth(layers["depth"], info, jitter, np).astype(np.float32)
 
     @cached_property
     def _hr_layers(self) -> frozenset[str]:

@@ -18,7 +18,7 @@ from jaxsr.ops.color import (
     ycocg_from_rgb,
 )
 from jaxsr.ops.demodulation import demodulate, demodulation_divisor, modulate
-from jaxsr.ops.geometry import camera_motion, project, view_directions, world_position
+from jaxsr.ops.geometry import camera_motion, previous_depth, project, view_directions, world_position
 from jaxsr.ops.jitter import (
     SamplePositions,
     current_positions,
@@ -87,6 +87,7 @@ __all__ = [
     "position_mask",
     "positions_from_jittered_motion",
     "positions_from_motion",
+    "previous_depth",
     "project",
     "reproject",
     "resize",

@@ -15,6 +15,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsr import srgb as curve
 from jaxsr.errors import JaxsrError
 
 KINDS = ("aces", "reinhard", "log")
@@ -24,11 +25,11 @@ WHITE = 7.2416735
 
 
 def _floor(x: Array, low: float = 0.0) -> Array:
-    # Unlike maximum: the whole gradient at the bound itself, where black pixels are, and NaN is kept.
-    return jnp.where(x < low, low, x)
+    return curve.at_least(x, low, jnp)
 
 
 def _ceil(x: Array, high: float) -> Array:
+    # As `curve.at_least`, from above.
     return jnp.where(x > high, high, x)
 
 
@@ -85,17 +86,13 @@ def inverse_tone_map(toned: Float[Array, "*n"], kind: str = "aces") -> Float[Arr
 @jax.jit
 def srgb_from_linear(linear: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The sRGB transfer function, IEC 61966-2-1, exact in both pieces; not clipped above 1."""
-    x = _floor(linear)
-    curved = 1.055 * _floor(x, 0.0031308) ** (1 / 2.4) - 0.055  # floored: x^(1/2.4) has no slope at 0
-    return jnp.where(x <= 0.0031308, 12.92 * x, curved)
+    return curve.srgb_from_linear(linear, jnp)
 
 
 @jax.jit
 def linear_from_srgb(srgb: Float[Array, "*n"]) -> Float[Array, "*n"]:
     """The inverse of `srgb_from_linear`, likewise exact and not clipped above 1."""
-    x = _floor(srgb)
-    curved = ((_floor(x, 0.04045) + 0.055) / 1.055) ** 2.4
-    return jnp.where(x <= 0.04045, x / 12.92, curved)
+    return curve.linear_from_srgb(srgb, jnp)
 
 
 @jax.jit

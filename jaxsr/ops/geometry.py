@@ -11,58 +11,12 @@ import functools
 
 import jax
 import jax.numpy as jnp
-from jax.typing import DTypeLike
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera
+from jaxsr.ops import pinhole
 from jaxsr.ops._batch import over_batch
-from jaxsr.ops.resampling import pixel_grid
-
-BEHIND_PX = -1e6
-"""Both coordinates of a point at or behind the plane of the eye: finite, and outside every image."""
-
-_NEAR = 1e-6
-
-
-def rotate(matrix: Array, vectors: Array) -> Array:
-    """`matrix @ vector` for each of `[..., 3]` vectors."""
-    # Sums of products fuse, and no matrix unit rounds to fewer bits, which would move points by pixels.
-    lead = (None,) * (vectors.ndim - 1)
-    x, y, z = (vectors[..., k : k + 1] * matrix[:, k][lead] for k in range(3))
-    return x + y + z
-
-
-def view_rays(pixels: Array, camera: Camera, size: tuple[int, int]) -> Array:
-    """View-space rays of unit view depth through `[h, w, 2]` positions of the unjittered image."""
-    ndc = (pixels + 0.5) * jnp.array([2 / size[1], 2 / size[0]], pixels.dtype)[None, None] - 1
-    xy = (ndc + camera.lens_shift[None, None]) * camera.tan_half_fov[None, None]
-    return jnp.concatenate([xy, jnp.ones_like(xy[..., :1])], axis=-1)
-
-
-def unjittered_positions(size: tuple[int, int], jitter: Array | None, dtype: DTypeLike) -> Array:
-    """The position in the unjittered image that each pixel shows: p + J."""
-    grid = pixel_grid(*size, dtype)
-    return grid if jitter is None else grid + jitter[None, None]
-
-
-def view_from_view(camera: Camera, previous: Camera) -> tuple[Array, Array]:
-    """Rotation and translation from the view space of one camera to that of another."""
-    now, then = jnp.asarray(camera.world_from_view), jnp.asarray(previous.world_from_view)
-    turn = jnp.matmul(then[:3, :3].T, now[:3, :3], precision=jax.lax.Precision.HIGHEST)
-    return turn, rotate(then[:3, :3].T, now[:3, 3] - then[:3, 3])  # difference first: worlds are large
-
-
-def _project_view(points: Array, camera: Camera, size: tuple[int, int]) -> tuple[Array, Array]:
-    """Pixels and depth of view-space points."""
-    lead = (None,) * (points.ndim - 1)
-    depth = points[..., 2:]
-    before = depth > _NEAR
-    ndc = (
-        points[..., :2] / jnp.where(before, depth, 1.0) / camera.tan_half_fov[lead] - camera.lens_shift[lead]
-    )
-    half_size = jnp.array([size[1] / 2, size[0] / 2], points.dtype)[lead]
-    return jnp.where(before, (ndc + 1) * half_size - 0.5, BEHIND_PX), depth
 
 
 def _check_size(where: str, size: tuple[int, int]) -> None:
@@ -89,9 +43,8 @@ def view_directions(
     _check_size("view_directions", size)
 
     def one(matrix: Array, camera: Camera, jitter: Array | None) -> Array:
-        return rotate(
-            matrix[:3, :3], view_rays(unjittered_positions(size, jitter, matrix.dtype), camera, size)
-        )
+        pixels = pinhole.unjittered_positions(size, jitter, matrix.dtype)
+        return pinhole.rotate(matrix[:3, :3], pinhole.view_rays(pixels, camera, size))
 
     return over_batch(one, jnp.asarray(camera.world_from_view), camera, jitter_px, ndim=2)
 
@@ -107,18 +60,7 @@ def world_position(
         camera: of the same frame.
         jitter_px: J in pixels of this image.
     """
-
-    def one(depth: Array, camera: Camera, jitter: Array | None) -> Array:
-        matrix = jnp.asarray(camera.world_from_view)
-        size = (depth.shape[0], depth.shape[1])
-        rays = rotate(
-            matrix[:3, :3], view_rays(unjittered_positions(size, jitter, depth.dtype), camera, size)
-        )
-        hit = jnp.isfinite(depth)
-        point = matrix[None, None, :3, 3] + jnp.where(hit, depth, 0.0) * rays
-        return jnp.where(hit, point, 0.0)
-
-    return over_batch(one, depth_linear, camera, jitter_px)
+    return over_batch(pinhole.world_from_depth, depth_linear, camera, jitter_px)
 
 
 @functools.partial(jax.jit, static_argnames=("size",))
@@ -134,16 +76,15 @@ def project(
 
     Returns:
         Pixels (x, y), which may lie outside the image, and linear view depth. A point at or behind the plane
-        of the eye has no pixel: it gets `BEHIND_PX` twice and its own depth.
+        of the eye has no pixel: it gets `pinhole.BEHIND_PX` twice and its own depth.
 
     Raises:
         JaxsrError: bad size.
     """
     _check_size("project", size)
 
-    def one(matrix: Array, camera: Camera, world: Array) -> tuple[Array, Array]:
-        offset = world - matrix[(None,) * (world.ndim - 1) + (slice(3), 3)]
-        return _project_view(rotate(matrix[:3, :3].T, offset), camera, size)
+    def one(_: Array, camera: Camera, world: Array) -> tuple[Array, Array]:
+        return pinhole.pixels_from_world(world, camera, size)
 
     return over_batch(one, jnp.asarray(camera.world_from_view), camera, world, ndim=2)
 
@@ -167,17 +108,30 @@ def camera_motion(
         jitter_px: J of the depth buffer in its own pixels.
 
     Returns:
-        Motion in pixels of the depth buffer. A point that was behind the eye has `p_prev = BEHIND_PX`.
+        Motion in pixels of the depth buffer. A point that was behind the eye has `p_prev = pinhole.BEHIND_PX`.
     """
+    return over_batch(pinhole.still_motion, depth_linear, camera, previous_camera, jitter_px)
 
-    def one(depth: Array, camera: Camera, before: Camera, jitter: Array | None) -> Array:
-        size = (depth.shape[0], depth.shape[1])
-        turn, shift = view_from_view(camera, before)
-        here = unjittered_positions(size, jitter, depth.dtype)
-        # Homogeneous points ray + shift / depth: at infinite depth only the rotation is left.
-        inverse = jnp.where(jnp.isfinite(depth), 1 / jnp.where(depth > _NEAR, depth, _NEAR), 0.0)
-        points = rotate(turn, view_rays(here, camera, size)) + inverse * shift[None, None]
-        pixels, _ = _project_view(points, before, size)
-        return here - pixels
 
-    return over_batch(one, depth_linear, camera, previous_camera, jitter_px)
+@jax.jit
+def previous_depth(
+    depth_linear: Float[Array, "*b h w 1"],
+    camera: Camera,
+    previous_camera: Camera,
+    jitter_px: Float[Array, "*b 2"] | None = None,
+) -> Float[Array, "*b h w 1"]:
+    """The linear view depth that the point of each pixel had in the previous view, if it stands still.
+
+    What was seen at the end of the motion can be compared with it: the same surface has this depth there.
+
+    Args:
+        depth_linear: of the current frame, +inf for sky.
+        camera: of the current frame.
+        previous_camera: of the frame before.
+        jitter_px: J of the depth buffer in its own pixels.
+
+    Returns:
+        Depth in the view of `previous_camera`, +inf for sky, with no gradient there. It is 0 or less for a
+        point that was at or behind the plane of the eye.
+    """
+    return over_batch(pinhole.still_depth, depth_linear, camera, previous_camera, jitter_px)

@@ -19,8 +19,9 @@ from jaxtyping import Array, Float
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, GBuffer
 from jaxsr.ops._batch import over_batch
-from jaxsr.ops.geometry import camera_motion, rotate, unjittered_positions, view_from_view, view_rays
+from jaxsr.ops.geometry import camera_motion
 from jaxsr.ops.jitter import jittered_motion
+from jaxsr.ops.pinhole import rotate, unjittered_positions, view_from_view, view_rays
 from jaxsr.ops.resampling import gather_pixels, pixel_grid, upsample
 from jaxsr.ops.warping import backward_warp
 

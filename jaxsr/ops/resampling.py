@@ -10,6 +10,7 @@ NaN pixel reaches only the results that give it a weight: depth +inf for sky doe
 """
 
 import functools
+from types import ModuleType
 from typing import Any
 
 import jax
@@ -157,8 +158,13 @@ def sample(
     return over_batch(one, image, positions_px)
 
 
-def pixel_grid(height: int, width: int, dtype: DTypeLike = jnp.float32, xnp=jnp) -> Float[Array, "h w 2"]:
+def pixel_grid(height: int, width: int, dtype: DTypeLike = jnp.float32) -> Float[Array, "h w 2"]:
     """The position (x, y) of every pixel, in pixels: (0, 0) is the centre of the top left one."""
+    return grid(height, width, dtype, jnp)
+
+
+def grid(height: int, width: int, dtype: DTypeLike, xnp: ModuleType) -> Any:
+    """`pixel_grid` in NumPy or JAX."""
     y, x = xnp.mgrid[:height, :width]
     return xnp.stack([x, y], axis=-1).astype(dtype)
 

@@ -5,13 +5,16 @@ import pytest
 
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
+from tests.reference import geometry as reference
 
 SIZE = (48, 27)
 
 
 def _cast(time, x, y):
     view = analytic.camera(time, SIZE)
-    origin, rays = analytic._rays(view, x, y, SIZE)
+    origin = view.world_from_view[:3, 3]
+    rays = np.array([reference.ray(view, SIZE[::-1], pixel) for pixel in zip(x.flat, y.flat, strict=True)])
+    rays = rays.reshape(*x.shape, 3)
     distance, index = analytic._nearest(analytic.scene(), origin, rays, time)
     return origin + distance[..., None] * rays, index
 

@@ -17,8 +17,8 @@ from jaxsr.data.augment import crop, flip, random_crop
 from jaxsr.data.windows import NEEDS, WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera
-from jaxsr.io.geometry import world_position
 from jaxsr.layers import LAYERS
+from jaxsr.ops.pinhole import world_from_depth
 from tests.builders import make_sequence
 
 SIZE = (96, 60)
@@ -84,7 +84,7 @@ def test_the_camera_sees_the_same_points_in_the_crop(case):
         def positions(window, t=t, place=place, s=s):
             frame, _ = at(window, t)
             jitter = (0.0, 0.0) if s == 1 else tuple(frame.jitter_px.tolist())
-            return world_position(getattr(frame, place).depth_linear, frame.camera, jitter)
+            return world_from_depth(getattr(frame, place).depth_linear, frame.camera, jitter, np)
 
         expected = positions(whole)[y // s : (y + h) // s, x // s : (x + w) // s]
         expected = expected[:: -1 if vertical else 1, :: -1 if horizontal else 1] * mirror

@@ -9,10 +9,11 @@ import pytest
 from rich.console import Console
 
 from jaxsr.data import analytic
-from jaxsr.inspection.conventions import CONVENTIONS, UNITS, MotionConvention, is_sky, project
+from jaxsr.inspection.conventions import CONVENTIONS, UNITS, MotionConvention, is_sky
 from jaxsr.inspection.inspect import inspect, print_report
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.sequence import Sequence
+from jaxsr.ops.pinhole import pixels_from_world
 from tests.builders import edit_frames, frame_info, make_sequence
 
 SIZE = (160, 96)
@@ -39,8 +40,8 @@ def forward_motion(name, index, layers):
     for number, item in enumerate(analytic.scene(), 1):
         mask = ids == number
         later[mask] = item.to_world(item.to_local(position[mask], index), index + 1)
-    now = project(position, frame_info(index, (w, h)), (w, h))[0]
-    motion = project(later, frame_info(index + 1, (w, h)), (w, h))[0] - now
+    now, _ = pixels_from_world(position, frame_info(index, (w, h)), (h, w), np)
+    motion = pixels_from_world(later, frame_info(index + 1, (w, h)), (h, w), np)[0] - now
     layers["motion"] = np.where(is_sky(layers["depth"]), 0, motion).astype(np.float32)
 
 

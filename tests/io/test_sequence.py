@@ -350,7 +350,7 @@ def test_writer_refuses(tmp_path, hr, lr, message):
 def test_writing_needs_no_jax():
     code = (
         "import sys; sys.modules['jax'] = sys.modules['jaxtyping'] = None; "
-        "import jaxsr.io.writing, jaxsr.io.exr; "
+        "import jaxsr.io.writing, jaxsr.io.exr, jaxsr.layers, jaxsr.srgb; "
     )
     subprocess.run([sys.executable, "-c", code], check=True)
     code = "import sys; import jaxsr.io.images; assert 'jax' not in sys.modules"

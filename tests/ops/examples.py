@@ -89,6 +89,7 @@ def examples(dtype: Any = np.float32) -> dict[str, Example]:
             ops.positions_from_jittered_motion, (motion, jitter, before), (0, 1, 2)
         ),
         "positions_from_motion": Example(ops.positions_from_motion, (motion, jitter, before), (0, 1, 2)),
+        "previous_depth": Example(ops.previous_depth, (depth, camera, camera_before, jitter), (0, 1, 3)),
         "project": Example(
             lambda p, c: ops.project(p, c, (h, w)), (image(3, low=1.0, high=2.0), camera), both
         ),

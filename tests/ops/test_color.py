@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from jaxsr import ops
+from jaxsr import ops, srgb
 from jaxsr.errors import JaxsrError
 from jaxsr.ops.color import KINDS
 from tests.reference import color as reference
@@ -69,6 +69,19 @@ def test_srgb_and_ycocg_are_colour_science():
     np.testing.assert_allclose(ops.srgb_from_linear(rgb), GOLDEN["srgb"], atol=1e-6)
     np.testing.assert_allclose(ops.linear_from_srgb(rgb), GOLDEN["linear"], atol=1e-6)
     np.testing.assert_allclose(ops.ycocg_from_rgb(rgb), GOLDEN["ycocg"], atol=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_srgb_in_numpy(dtype):
+    """IEC 61966-2-1: the two pieces meet at 0.04045, and 0.5 decodes to 0.21404."""
+    x = np.array([-1.0, 0.0, 0.04045, 0.5, 1.0, 1.5, np.nan], dtype)
+    linear = srgb.linear_from_srgb(x)
+    np.testing.assert_allclose(linear[:5], [0, 0, 0.0031308, 0.2140411, 1], atol=1e-6)
+    assert linear.dtype == srgb.srgb_from_linear(x).dtype == dtype
+    np.testing.assert_allclose(srgb.srgb_from_linear(linear)[1:], x[1:], atol=1e-6)
+    expected = [reference.srgb_from_linear(float(v)) for v in x[:-1]]
+    np.testing.assert_allclose(srgb.srgb_from_linear(x)[:-1], expected, rtol=1e-6)
+    assert np.isnan(srgb.srgb_from_linear(x)[-1])
 
 
 @given(size=st.sampled_from([(1, 1), (3, 5)]), seed=st.integers(0, 10**6))

@@ -12,7 +12,7 @@ from jaxsr import ops
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera
-from jaxsr.ops.geometry import BEHIND_PX
+from jaxsr.ops.pinhole import BEHIND_PX
 from tests.reference import geometry as reference
 from tests.reference import golden_ops
 from tests.transforms import assert_jit_and_batch
@@ -66,6 +66,28 @@ def test_camera_motion_is_the_loop(size, seed):
     before, jitter = _camera(rng, near=camera), jnp.asarray(rng.uniform(-0.5, 0.5, 2), jnp.float32)
     expected = reference.camera_motion(np.asarray(depth), camera, before, np.asarray(jitter))
     np.testing.assert_allclose(ops.camera_motion(depth, camera, before, jitter), expected, atol=2e-4)
+
+
+@given(size=st.sampled_from(SIZES), seed=st.integers(0, 10**6))
+def test_previous_depth_is_the_loop(size, seed):
+    rng = np.random.default_rng(seed)
+    camera, depth = _camera(rng), _depth(rng, size)
+    before, jitter = _camera(rng, near=camera), jnp.asarray(rng.uniform(-0.5, 0.5, 2), jnp.float32)
+    expected = reference.previous_depth(np.asarray(depth), camera, before, np.asarray(jitter))
+    found = ops.previous_depth(depth, camera, before, jitter)
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-4)
+
+
+def test_previous_depth_of_a_step_forward_is_the_step_more():
+    """Towards a wall: one unit of the way makes all depths one smaller, whatever the distance and pixel."""
+    identity = Camera(jnp.eye(4), jnp.ones(2), jnp.zeros(2))
+    advanced = identity._replace(world_from_view=jnp.eye(4).at[2, 3].set(1.0))
+    depth = jnp.asarray([[[0.5], [3.0]], [[1e4], [jnp.inf]]])
+    np.testing.assert_allclose(ops.previous_depth(depth, advanced, identity), depth + 1)
+    found = ops.previous_depth(depth, identity, advanced)
+    np.testing.assert_allclose(found, depth - 1)  # the nearest point was behind the eye
+    slope = jax.grad(lambda d: jnp.where(jnp.isfinite(d), ops.previous_depth(d, identity, advanced), 0).sum())
+    np.testing.assert_allclose(slope(depth), [[[1], [1]], [[1], [0]]])
 
 
 @given(size=st.sampled_from(SIZES), seed=st.integers(0, 10**6))
@@ -148,7 +170,9 @@ def test_sky_gives_finite_values_and_gradients():
 
     def total(depth, camera, before):
         position = ops.world_position(jnp.where(depth < 1e20, depth, jnp.inf), camera)
-        return position.sum() + ops.camera_motion(depth, camera, before).sum()
+        then = ops.previous_depth(jnp.where(depth < 1e20, depth, jnp.inf), camera, before)
+        still = ops.camera_motion(depth, camera, before)
+        return position.sum() + still.sum() + jnp.where(jnp.isfinite(then), then, 0).sum()
 
     value, gradients = jax.value_and_grad(total, argnums=(0, 1, 2))(depth, camera, before)
     assert np.isfinite(value)
@@ -165,6 +189,7 @@ def test_gradients_are_the_differences():
     depth = jnp.asarray(rng.uniform(2, 4, (2, 3, 1)), jnp.float32)
     arguments = {"order": 1, "modes": ["rev"], "atol": 2e-2, "rtol": 2e-2}
     check_grads(lambda d, b: ops.camera_motion(d, camera, b), (depth, before), **arguments)
+    check_grads(lambda d, b: ops.previous_depth(d, camera, b), (depth, before), **arguments)
     check_grads(ops.world_position, (depth, camera), **arguments)
 
 
@@ -179,6 +204,7 @@ def test_jit_and_batch():
     assert_jit_and_batch(lambda c, j: ops.view_directions(c, (3, 4), j), now, jitter)
     assert_jit_and_batch(ops.world_position, depth, now, jitter, **check)
     assert_jit_and_batch(ops.camera_motion, depth, now, before, jitter, **check)
+    assert_jit_and_batch(ops.previous_depth, depth, now, before, jitter, **check)
     assert_jit_and_batch(lambda w, c: ops.project(w, c, (3, 4)), world, now, **check)
 
 

@@ -43,3 +43,15 @@ def camera_motion(depth, camera, before, jitter) -> np.ndarray:
             point = np.asarray(camera[0], np.float64)[:3, 3] + z * ray(camera, (h, w), (x, y), jitter)
             out[y, x] = np.array([x, y]) + jitter - project(before, (h, w), point)[0]
     return out
+
+
+def previous_depth(depth, camera, before, jitter) -> np.ndarray:
+    h, w, _ = depth.shape
+    out = np.full((h, w, 1), np.inf)
+    for y in range(h):
+        for x in range(w):
+            z = float(depth[y, x, 0])
+            if np.isfinite(z):
+                point = np.asarray(camera[0], np.float64)[:3, 3] + z * ray(camera, (h, w), (x, y), jitter)
+                out[y, x] = project(before, (h, w), point)[1]
+    return out
