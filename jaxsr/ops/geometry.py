@@ -108,7 +108,7 @@ def camera_motion(
         jitter_px: J of the depth buffer in its own pixels.
 
     Returns:
-        Motion in pixels of the depth buffer. A point that was behind the eye has `p_prev = pinhole.BEHIND_PX`.
+        Motion in pixels of the depth buffer. A point that was behind the eye comes from `pinhole.BEHIND_PX`.
     """
     return over_batch(pinhole.still_motion, depth_linear, camera, previous_camera, jitter_px)
 
