@@ -2,7 +2,7 @@
 
 import dataclasses
 import sys
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated, Any
 
 import tyro
@@ -50,7 +50,7 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
     ]
     chosen: Any = tyro.cli(
         dataclasses.make_dataclass("TrainingAndMethod", groups),
-        args=_renamed(rest),
+        args=_renamed(rest, {field.name for field in dataclasses.fields(options)}),
         prog=f"jaxsr train {name}",
         description=DESCRIPTION,
         config=(tyro.conf.OmitArgPrefixes,),
@@ -83,17 +83,28 @@ _OLD_NAMES = {
 }
 
 
-def _renamed(arguments: Sequence[str]) -> list[str]:
-    """The arguments with the names that options have now; old ones still work, and a line says so."""
+def _renamed(arguments: Sequence[str], own: Collection[str] = ()) -> list[str]:
+    """The arguments with the names that options have now; old ones still work, and a line says so.
+
+    Args:
+        arguments: after the name of the method.
+        own: names of the method's settings, which are never renamed.
+
+    Raises:
+        JaxsrError: an old option with a value that it never had.
+    """
     new: list[str] = []
     rest = iter(arguments)
     for argument in rest:
         name, equals, value = argument.partition("=")
-        if name not in _OLD_NAMES:
+        if name not in _OLD_NAMES or name.strip("-").replace("-", "_") in own:
             new.append(argument)
             continue
         if name == "--color":
-            now = ["--demodulated" if (value or next(rest, "")) == "lighting" else "--no-demodulated"]
+            choice = value or next(rest, "")
+            if choice not in ("display", "lighting"):
+                raise JaxsrError("bad color", where=name, expected="display or lighting", found=choice)
+            now = ["--demodulated" if choice == "lighting" else "--no-demodulated"]
         elif name == "--start":
             choice = value or next(rest, "")
             now = ["--base", "none" if choice == "nothing" else choice]

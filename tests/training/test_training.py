@@ -23,7 +23,7 @@ from jaxsr.io.images import read_png
 from jaxsr.methods import fusion_sr, variant
 from jaxsr.methods.image_loss import ImageLoss
 from jaxsr.progress import Bar
-from jaxsr.training import TrainConfig, loop
+from jaxsr.training import TrainConfig, command, loop
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
 from jaxsr.training.record import Log, plot_curve
@@ -533,6 +533,28 @@ class TestErrors:
         more = ["--out", tmp_path / "out"] if arguments[1:] else []
         assert expected in error_line(capsys, "train", *arguments, *more)
         assert not (tmp_path / "out").exists()
+
+
+def test_old_names_of_options_still_work(capsys):
+    old = [
+        "--color",
+        "lighting",
+        "--start=nothing",
+        "--no-follow-jitter",
+        "--compute",
+        "bfloat16",
+        "--steps",
+        "3",
+    ]
+    new = ["--demodulated", "--base", "none", "--no-unjitter", "--dtype", "bfloat16", "--steps", "3"]
+    assert command._renamed(old) == new
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[0] == "jaxsr train: --color is now --demodulated; the old name will go"
+    assert len(lines) == 4
+    assert command._renamed(["--color=display"]) == ["--no-demodulated"]
+    assert command._renamed(old, own=("color", "start", "no_follow_jitter", "compute")) == old
+    with pytest.raises(JaxsrError, match="--color: bad color; expected display or lighting; found hdr"):
+        command._renamed(["--color", "hdr"])
 
 
 def test_a_killed_log_loses_no_row(tmp_path):
