@@ -1,9 +1,9 @@
 """Pure functions on arrays: no files, no networks, no state.
 
-What takes images takes one `[H, W, C]` or a batch `[B, H, W, C]`, is jitted, and is differentiable unless it
-says otherwise. Masks and motion are images in this sense; `halton` and `jitter_sequence` compute in NumPy on
-the host, and `pixel_grid` and `demodulation_divisor` are plain expressions. `jaxsr.frames` states the
-conventions.
+A function of images takes one `[H, W, C]` or a batch `[B, H, W, C]`. It is jitted, and it is differentiable
+unless its docstring says otherwise. Masks and motion are images in this sense. `halton` and `jitter_sequence`
+compute in NumPy on the host; `pixel_grid` and `demodulation_divisor` are plain expressions. `jaxsr.frames`
+states the conventions.
 """
 
 from jaxsr.ops.color import (

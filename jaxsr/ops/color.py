@@ -1,12 +1,12 @@
 """Tone curves, sRGB, YCoCg, luminance, and DISPLAY: the display-referred colour of jaxsr.
 
-Scene-linear colour is unbounded. DISPLAY colour is `sRGB(clip(ACES(exposure * linear)))` in [0, 1]: metrics,
-perceptual losses and written images see no other. ACES is Narkowicz' fit of the filmic curve. Primaries are
-those of sRGB throughout; no gamut is converted.
+Scene-linear colour is unbounded. DISPLAY colour is `sRGB(clip(ACES(exposure * linear)))` in [0, 1]. Metrics,
+perceptual losses and written images see only this colour. ACES is Narkowicz' fit of the filmic curve. The
+primaries are those of sRGB throughout; no gamut is converted.
 
-Out of range: below 0 counts as 0 with no gradient (the curves are one-sided, with their right derivative
-at 0), +inf as very large, and NaN stays NaN, so that a broken pixel is seen and not hidden. Gradients are
-finite at 0 and at any finite value whose result does not overflow.
+Values out of range: a value below 0 counts as 0 and has no gradient (the curves are one-sided, with their
+right derivative at 0). +inf counts as a very large value. NaN stays NaN, so that a broken pixel can be seen.
+Gradients are finite at 0 and at any finite value whose result does not overflow.
 """
 
 import functools
@@ -29,7 +29,7 @@ def _floor(x: Array, low: float = 0.0) -> Array:
 
 
 def _ceil(x: Array, high: float) -> Array:
-    # As `curve.at_least`, from above.
+    # The same as `at_least`, for an upper bound.
     return jnp.where(x > high, high, x)
 
 

@@ -1,17 +1,17 @@
 """Demodulation: colour = divisor x lighting, so that filters see smooth lighting instead of textures.
 
 The divisor is the base colour (ExtraSS, notes section on G-buffer-guided reprojection), or with `specular`
-that of ExtraNet for glossy scenes, `base + 0.08 specular (1 - metallic)`. Everything is scene-linear.
+the one of ExtraNet for glossy scenes, `base + 0.08 specular (1 - metallic)`. Everything is scene-linear.
 
 On a surface each channel of the divisor is at least `eps`, also where the base colour is exactly 0 or NaN.
-The guard bounds lighting by `color / eps` and the gradient with respect to the base colour by
-`color / eps^2`; without it a dark texel makes one bright speck of lighting that a filter would spread. The
+This guard bounds lighting by `color / eps`, and its gradient with respect to the base colour by
+`color / eps^2`. Without it a dark texel would make a bright speck of lighting that a filter spreads. The
 divisor is continuous in the base colour: lighting that a filter carries from a dark surface to a black one
 keeps its scale.
 
-Off the surfaces (sky) the divisor is 1, hence lighting is colour. Only `surface` says what is sky, and it
-comes from depth: `surface=jnp.isfinite(depth_linear)`. A base colour of 0 does not mean sky, because ink,
-rubber and dark screens have it too. `modulate` inverts `demodulate` for equal arguments.
+On sky the divisor is 1, so that lighting equals colour. Only `surface` says what is sky, and it comes from
+depth: `surface=jnp.isfinite(depth_linear)`. A base colour of 0 does not mean sky, because ink, rubber and
+dark screens have it too. `modulate` inverts `demodulate` for equal arguments.
 """
 
 import functools

@@ -17,8 +17,8 @@ def normalized_depth(
 ) -> Float[Array, "*b H W 1"]:
     """Linear depth to [0, 1]: `0.5 + log2(d / m) / octaves`, m the geometric mean of the surfaces; sky is 1.
 
-    It does not depend on the unit of length. A crop shifts all values by a constant, and the contrast between
-    two surfaces is the ratio of their depths wherever they are.
+    The result does not depend on the unit of length. A crop shifts all values by a constant. The difference
+    between two surfaces depends only on the ratio of their depths.
 
     Args:
         depth_linear: linear view depth, +inf for sky.
@@ -32,14 +32,14 @@ def normalized_depth(
 
 
 def compress_lighting(lighting: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """`l = sqrt(L / (1 + L))` in [0, 1): about as many steps in the dark as a display has."""
+    """`l = sqrt(L / (1 + L))` in [0, 1). The root spaces dark values about as finely as a display does."""
     lighting = jnp.clip(lighting, 0, 1e6)  # infinite light is white, not NaN
     # The lower bound keeps the slope of the root finite at black.
     return jnp.sqrt(jnp.maximum(lighting / (1 + lighting), 1e-8))
 
 
 def expand_lighting(compressed: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """The inverse of `compress_lighting`; 0.999 and above is L = 499."""
+    """The inverse of `compress_lighting`. Values of 0.999 and above give L = 499."""
     squared = jnp.minimum(compressed, MAX_COMPRESSED) ** 2
     return squared / (1 - squared)
 

@@ -11,15 +11,16 @@ and `positions_from_motion` are, in pixels instead of texture coordinates:
     (7) I_N,t(p) = I_J,t-1(p - J_t - MV_J,t)
     (8) I_N,t(p) = I_N,t-1(p - MV_J,t + J_{t-1} - J_t)
 
-Two misprints. Equation (8) is printed with `p - J_t - MV_J,t + ...`, one J_t too many: put (6) into (2), or
-read the shader line under it, which has it right. The right half of (5) needs I_J,t(p), not I_J,t(p - J_t),
-on its left. And one approximation: a motion buffer belongs to the jittered frame, so that MV_N,t(p) is found
-in it at p - J_t. The first shader reads it at p, which is exact only where neighbouring pixels move alike;
-the second reads it at p - J_t.
+The article has two misprints. Equation (8) is printed with `p - J_t - MV_J,t + ...`, one J_t too many: put
+(6) into (2), or read the shader line under it, which is right. The right half of (5) needs I_J,t(p), not
+I_J,t(p - J_t), on its left. The article also makes one approximation: a motion buffer belongs to the
+jittered frame, so that MV_N,t(p) is found in it at p - J_t. The first shader reads it at p, which is exact
+only where neighbouring pixels move alike; the second reads it at p - J_t.
 
-All is in pixels of the image in question; jitter and motion in LR pixels unless said, J in [-0.5, 0.5].
-The positions are differentiable in motion and jitter. `resampling.sample` reads images there;
-`sample_jittered` does both for the current frame.
+Everything is in pixels of its own image. Jitter and motion are in LR pixels unless a docstring says
+otherwise, and J is in [-0.5, 0.5]. The positions are differentiable in motion and jitter.
+`resampling.sample` reads an image at such positions; `sample_jittered` computes them and reads, for the
+current frame.
 """
 
 import functools

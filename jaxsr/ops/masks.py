@@ -7,7 +7,7 @@ where no camera is known. A pixel that comes from outside the previous image is 
 
 Motion is backward, in pixels of its own image, between the two images as they are: for jittered G-buffers
 pass `jitter.jittered_motion`, except to `disocclusion_mask`, which takes the jitters and does it itself.
-A tap counts if its bilinear weight exceeds 1 %: motion of 1e-4 px must not call on a neighbour.
+A tap counts if its bilinear weight exceeds 1 %, so that motion of 1e-4 px does not read a neighbour.
 """
 
 import functools
@@ -33,7 +33,7 @@ def _as_mask(valid: Array, like: Array) -> Array:
 
 
 def _dot(a: Array, b: Array) -> Array:
-    """Over the channels, which stay. Written out: a CPU reduction over three values costs 80 times more."""
+    """The sum over the channels, `[..., 1]`. Written out, it is 80 times faster on a CPU than a reduction."""
     return functools.reduce(jnp.add, [a[..., c : c + 1] * b[..., c : c + 1] for c in range(a.shape[-1])])
 
 
@@ -232,9 +232,10 @@ def disocclusion_mask(
 ) -> Float[Array, "*b h w 1"]:
     """All tests together, each where it applies (ExtraNet section 3): 1 valid, 0 hole.
 
-    An object moves where its motion differs from `camera_motion`. Static: `position_mask`. Moving:
-    `normal_mask` with "nearest" normals. Both: `stencil_mask`, and the origin in the frame. Tests whose
-    buffers (normal, object_id) are None in either frame are left out.
+    An object moves where its motion differs from `camera_motion`. `position_mask` tests static pixels, and
+    `normal_mask` with "nearest" normals tests moving ones. For both, `stencil_mask` must hold and the pixel
+    must come from inside the frame. A test is left out if its buffer (normal, object_id) is None in either
+    frame.
 
     Args:
         gbuffer: of the current frame; `motion_px` unjittered as always.

@@ -48,8 +48,8 @@ def hr_from_lr(
     """Unjittered HR depth and motion from jittered LR ones.
 
     The HR pixel p lies at `(p + 0.5) / scale - 0.5 - J` in the jittered LR image (`I_J(p) = I_N(p + J)`) and
-    takes the dilated depth and motion of the LR pixel there. Nothing is interpolated: no depth and no motion
-    arises that no surface has. Motion is multiplied by the scale.
+    takes the dilated depth and motion of the LR pixel there. Nothing is interpolated: every depth and
+    motion is that of some surface. Motion is multiplied by the scale.
 
     Args:
         depth_linear: LR, above 0, +inf for sky.

@@ -34,9 +34,9 @@ DEFAULT_SIGMA_SPACE = 2.0
 """Standard deviation of the distance to xbar, in pixels (likewise)."""
 
 _TINY_SIGMA = 1e-9  # keeps 1/sigma finite
-_CLIP = 1e12  # scaled guides stay below; the squares of their differences ...
-_NOWHERE = 1e28  # ... stay far below this, ...
-_FAR = 1e15  # ... and those to what is not there lie far above, and are finite
+_CLIP = 1e12  # bound of scaled guides: squares of their differences are far below _NOWHERE
+_NOWHERE = 1e28  # distances above it are those to pixels that do not count
+_FAR = 1e15  # scaled guide of a pixel that does not count: its distance is far above _NOWHERE, and finite
 _NORMAL = 1e-12  # keeps keys out of the denormal numbers, which some processors flush to 0
 
 T = TypeVar("T")
@@ -112,7 +112,7 @@ def _reproject(
     batching: Batching,
     fence: Fence,
 ) -> tuple[Array, Array]:
-    """`reproject` in one of several forms of equal results; `benchmarks/reproject.py` times them.
+    """`reproject` in one of several forms that give equal results; `benchmarks/reproject.py` times them.
 
     Args:
         arrays: previous values, motion, guide, previous guide.
@@ -215,8 +215,8 @@ class _Neighbourhood(NamedTuple):
 def _padded(guide: Float[Array, "h w g"], scale: Float[Array, " g"], pad: int) -> Float[Array, "hp wp g"]:
     """The guide over sqrt(2) sigma_0, padded so widely that every candidate is a constant step from [xbar].
 
-    What lies outside is so far from any guide that it needs no test: it is just extremely different. So is
-    a pixel whose guide is not finite.
+    Pixels outside the frame, and those whose guide is not finite, get the value `_FAR`, which differs so much
+    from any guide that they need no test of their own.
     """
     finite = jnp.isfinite(guide).all(-1, keepdims=True)
     scaled = jnp.where(finite, guide, 0).astype(scale.dtype) * scale[None, None, :]
@@ -246,7 +246,7 @@ def _is_number(motion: Float[Array, "h w 2"]) -> Bool[Array, "h w"]:
 
 
 class _Pixel(NamedTuple):
-    """What all candidates of a pixel share. It is cheap, so each loop computes it again."""
+    """What all candidates of a pixel share. It is cheap to compute, so that each loop does it again."""
 
     corner: Int[Array, "h w *k"]
     """Index of [xbar] in the padded guide."""
@@ -344,12 +344,13 @@ def _filter(
     count = distance.shape[-1]
     dtype = np.promote_types(value.dtype, distance.dtype)
     valid = distance[..., :1] < _NOWHERE
-    # The first is the heaviest but for near-ties; the limit (not 0, where its gradient would be halved) only
-    # acts on those of weights below exp(-10^6).
+    # The first is the heaviest, near-ties apart. The limit only acts on near-ties whose weights are below
+    # exp(-10^6). It is not 0, because minimum halves the gradient where both sides are equal.
     nearest = jax.lax.stop_gradient(distance[..., :1])
     weight = jnp.exp(jnp.minimum(nearest - distance, 10))
     weight = jnp.where(valid & (distance < _NOWHERE), weight, 0)
-    # Where nothing is valid all are equal, and the first is the centre: its clamped pixel is the fallback.
+    # Where nothing is valid all distances are equal, so that the first candidate is the centre. Its clamped
+    # pixel is the fallback.
     weight = jnp.where(valid | (np.arange(count) > 0)[None, None, :], weight, 1)
 
     pixels = value.reshape(h * w, channels)
@@ -360,7 +361,7 @@ def _filter(
     for k in range(count):
         index = jnp.clip(y + dy[..., k], 0, h - 1) * w + jnp.clip(x + dx[..., k], 0, w - 1)
         pixel = pixels.at[index.astype(jnp.uint32)].get(mode="promise_in_bounds").astype(dtype)
-        # What weighs nothing may not be a number: a pixel without a guide may have no colour either.
+        # A pixel of weight 0 may be NaN: where the guide is missing, the colour may be missing too.
         image = image + jnp.where(weight[..., k, None] > 0, pixel, 0) * weight[..., k, None]
         total = total + weight[..., k, None]
     confidence = jnp.where(valid, jnp.exp(-distance[..., :1]), 0)

@@ -120,7 +120,7 @@ def _split(position, mode: str, xnp=jnp):
 
 
 def _taps_at(position: Float[Array, "*n"], size: int, mode: str, boundary: str) -> list[tuple[Array, Array]]:
-    # Far or NaN positions would overflow the integers; four pixels outside, all taps are outside as well.
+    # Far or NaN positions would overflow the integers. At four pixels outside, all taps are outside too.
     position = jnp.clip(jnp.where(jnp.isnan(position), -4.0, position), -4.0, size + 3.0)
     base, fraction = _split(position, mode)
     return axis_taps(jax.lax.stop_gradient(base).astype(jnp.int32), fraction, size, mode, boundary)
@@ -173,8 +173,8 @@ def _resize_axis(image: Array, size: int, axis: int, mode: str) -> Array:
     old = image.shape[axis]
     if old == size:
         return image
-    # Positions are known in advance: indices and weights are float64 constants.
-    # One division, of whole numbers: exact halves stay exact.
+    # Positions are known in advance, so that indices and weights are float64 constants. The only division is
+    # one of whole numbers, so that exact halves stay exact.
     base, fraction = _split((np.arange(size) * 2 + 1) * old / (2 * size) - 0.5, mode, np)
     first = base.astype(np.int32) - (1 if mode == "bicubic" else 0)
     total = None
@@ -211,7 +211,7 @@ def _slice(image: Array, axis: int, start: Any, stop: Any) -> Array:
 
 
 def _upsample_axis(image: Array, scale: int, axis: int, mode: str) -> Array:
-    # Each of the `scale` phases is a fixed filter: slices of a padded image, no gather.
+    # Each of the `scale` phases is a fixed filter on slices of a padded image; there is no gather.
     pad = {"nearest": 0, "bilinear": 1, "bicubic": 2}[mode]
     first_pixel, last_pixel = _slice(image, axis, None, 1), _slice(image, axis, -1, None)
     padded = jnp.concatenate([first_pixel] * pad + [image] + [last_pixel] * pad, axis=axis)
@@ -270,7 +270,7 @@ def zero_upsample(
     if offset is None:
         offset = jnp.zeros((*batch, 2), jnp.int32)
     place = offset[..., None] == jnp.arange(scale, dtype=offset.dtype).reshape((1,) * offset.ndim + (scale,))
-    # [..., 1, dy, 1, dx, 1]; a comparison and a select: a scatter would not fuse, a product would spread NaN.
+    # [..., 1, dy, 1, dx, 1]. A select, because a scatter would not fuse and a product would spread NaN.
     here = place[..., 1, None, :, None, None, None] & place[..., 0, None, None, None, :, None]
     spread = jnp.where(here, image[..., :, None, :, None, :], jnp.zeros((), image.dtype))
     return spread.reshape(*batch, height * scale, width * scale, channels)

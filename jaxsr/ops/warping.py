@@ -6,10 +6,10 @@ writes there. Images are `[H, W, C]` or `[B, H, W, C]`; values have no range, re
 
 Whole pixels and fractions are split on the motion itself, not on `p - motion_px` as `resampling.sample` does
 with positions: a uniform motion then means the same thing at every pixel, also thousands of pixels from the
-origin. Rounding is half to even on the motion, where `sample` rounds positions half up. Motion of any size is
-fine; a NaN component counts as 0 (and gets no gradient), an infinite one points outside the image.
+origin. Halves of the motion round to even, whereas `sample` rounds halves of positions up. Motion may have
+any size. A NaN component counts as 0 and gets no gradient; an infinite one points outside the image.
 
-No guide, no hole filling: that is `jaxsr.ops.reprojection`.
+Nothing here uses a guide or fills holes: `jaxsr.ops.reprojection` does.
 """
 
 import functools
@@ -39,9 +39,9 @@ def backward_warp(
     """Read `image` where each pixel came from: `out(p) = image(p - motion_px(p))`.
 
     The filters are those of `resampling.sample`; "bicubic" is the history filter of temporal anti-aliasing
-    (Jimenez 2016) and overshoots at edges. A tap of zero weight adds nothing, so whole motion is an exact
-    shift of any values; at a fraction an infinite or NaN pixel reaches all that give it a weight (infinite or
-    NaN): warp depth with "nearest".
+    (Jimenez 2016) and overshoots at edges. A tap of zero weight adds nothing, so that whole motion is an
+    exact shift of any values. With fractional motion an infinite or NaN pixel makes every result that gives
+    it a weight infinite or NaN: warp depth with "nearest".
 
     Differentiable in `image` and, unless the mode is "nearest", in `motion_px`.
 

@@ -15,9 +15,11 @@ import zipfile
 import numpy as np
 import pytest
 
+from jaxsr.data.sample import sample_folder
 from jaxsr.errors import JaxsrError
 from jaxsr.io import archive
-from jaxsr.io.archive_coding import _FILTERS
+from jaxsr.io.archive_coding import _FILTERS, decode_frame
+from jaxsr.io.description import frame_info
 from jaxsr.io.sequence import Sequence
 from tests.builders import make_sequence
 
@@ -79,6 +81,29 @@ def test_the_rebuilt_archive_unpacks(packed, tmp_path):
     _, manifest, members = packed
     assert len(Sequence.open(unpack(rebuilt(tmp_path / "b.jsrz", manifest, members), tmp_path / "out"))) == 2
     assert blob_of(*notes_of(members[MEMBER])) == members[MEMBER]
+
+
+def test_archives_that_were_shipped_decode_to_the_same_values():
+    """Only differences from a predicted motion are stored: its roundings are part of the format."""
+    path = sample_folder() / "docks.jsrz"
+    name, head = next(iter(archive.read_manifest(path)["sequences"].items()))
+    before, info = (frame_info(entry, k, "docks") for k, entry in enumerate(head["frames"][:2]))
+    with zipfile.ZipFile(path) as file:
+        blob = file.read(f"{name}/x2/{info.index:04d}")
+    layers = decode_frame(blob, (108, 192), info, before, info.jitter_px)
+    y, x = [0, 1, 3, 3, 40, 70, 90], [171, 149, 5, 169, 60, 100, 20]
+    motion = [
+        [4.80660152, -1.60584605],
+        [3.47376466, -1.20636654],
+        [1.28150845, 0.10352215],
+        [4.65426588, -1.45451832],
+        [1.37817013, 0.25193718],
+        [1.57625258, 0.52949315],
+        [0.50366968, 0.8094486],
+    ]
+    np.testing.assert_allclose(layers["motion"][y, x], motion, rtol=3e-7, atol=3e-7)
+    np.testing.assert_allclose(layers["depth"][70, 100], 13.298683, rtol=1e-6)
+    np.testing.assert_allclose(layers["base_color"][90, 20], [0.15896083, 0.13843161, 0.12213878], rtol=1e-6)
 
 
 def test_members_of_rubbish_with_the_right_hash(packed, tmp_path):
