@@ -2,19 +2,24 @@
 
     python -m benchmarks.reproject [--quick] [--forms] [--batch 4]
 
-Ours against a plain numba loop over pixels (all cores, fast-math), against the plain JAX form of the tests
-(per-pixel gather, top_k, softmax), and against PyTorch eager (gather of all candidates, topk).
-Questions: the forward pass, forward with the gradient of the previous image, forward with all gradients.
+It compares ours with a plain numba loop over pixels (all cores, fast-math), with the plain JAX form of the
+tests (per-pixel gather, top_k, softmax), and with PyTorch eager (gather of all candidates, topk). It times
+the forward pass, forward with the gradient of the previous image, and forward with all gradients.
 With `--forms` only the forms of ours are compared, on the default device, a CPU or a GPU. A condition, an
 optimisation barrier or nothing keeps XLA from making copies, and a batch is mapped or vmapped. README.md has
 the times of a GPU.
 
-Tried for ours (CPU time over numba's, selection alone): winners as four outputs or whole-image keys 1.5-1.8;
-one packed output, planar guides 0.55; the same without signed indices 0.5; whole pixels of guides and where()
-for minimum 0.3, kept. Row bands and column strips gain nothing on top. A boundary that the compiler cannot
-remove keeps it from copying the selection into its readers: without it everything takes 5 times as long. The
-second pass as four arrays takes twice the time of one with the winners as last axis; jax.checkpoint around it
-saves 15 % of the gradient's memory and no time.
+Forms of the selection that were tried, with their CPU time over that of numba:
+
+    winners as four outputs, or keys of the whole image     1.5-1.8
+    one packed output, planar guides                        0.55
+    the same without signed indices                         0.5
+    whole pixels of guides, where() instead of minimum      0.3, kept
+
+Row bands and column strips gain nothing on top. The conditional boundary keeps XLA from copying the selection
+into its readers; without it everything takes 5 times as long. The second pass takes twice as long with four
+arrays as with the winners in the last axis. jax.checkpoint around it saves 15 % of the gradient's memory and
+no time.
 """
 
 import argparse

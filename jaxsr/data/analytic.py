@@ -1,10 +1,10 @@
 """An analytic scene with exact ground truth at any size: textured quads and spheres under a sun.
 
-Ray cast in NumPy float64, one sample a pixel, so every buffer is exact: depth, motion, normals, object ids
-and whether a point was visible one frame before. The camera turns and travels, a sphere rolls, a panel slides
-and a thin pole stands in front. Buffers obey `jaxsr.frames`; layer names are those of sequences on disk.
-Not a renderer: no anti-aliasing, no indirect light. Time is counted in frames, lengths in units of the world
-(z is up); unlike elsewhere in jaxsr sizes are (width, height).
+It is ray cast in NumPy float64 with one sample per pixel, so that every buffer is exact: depth, motion,
+normals, object ids and whether a point was visible one frame before. The camera turns and travels, a sphere
+rolls, a panel slides and a thin pole stands in front. Buffers obey `jaxsr.frames`; layer names are those of
+sequences on disk. It is no renderer: there is no anti-aliasing and no indirect light. Time is counted in
+frames and lengths in units of the world (z is up). Unlike elsewhere in jaxsr, sizes are (width, height).
 """
 
 from dataclasses import dataclass
@@ -38,7 +38,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Sphere:
-    """A textured ball that moves evenly, in units a frame, and spins about its vertical axis.
+    """A textured ball that moves evenly, in units per frame, and spins about its vertical axis.
 
     "Local" points are those at time 0: a point of the surface keeps its local position for ever.
     """
@@ -47,7 +47,7 @@ class Sphere:
     radius: float
     velocity: tuple[float, float, float]
     spin: float
-    """Radians a frame about the vertical axis."""
+    """Radians per frame about the vertical axis."""
     material: Material
 
     def intersect(self, origin: np.ndarray, rays: np.ndarray, time: float) -> np.ndarray:
@@ -87,7 +87,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Quad:
-    """A textured rectangle, seen from both sides, that moves evenly, in units a frame.
+    """A textured rectangle, seen from both sides, that moves evenly, in units per frame.
 
     The edges are at right angles and start at `origin`. "Local" points are world points at time 0.
     """

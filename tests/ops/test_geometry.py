@@ -152,6 +152,29 @@ def test_a_still_camera_moves_nothing_and_translation_spares_the_sky():
     assert np.abs(np.asarray(motion)[np.isfinite(depth[..., 0])]).min() > 1e-3
 
 
+def test_far_from_the_origin_of_the_world_nothing_changes():
+    """Float32 numbers near 65536 are 1/128 apart: differences are taken before anything is rotated."""
+    rng = np.random.default_rng(7)
+    depth = jnp.asarray(rng.uniform(1, 3, (4, 6, 1)), jnp.float32)
+    matrix = np.eye(4, dtype=np.float32)
+    matrix[:3, :3] = _rotation(np.array([1.0, 2.0, -1.0]), 0.8)
+    step, far = np.array([2, -1, 3]) / 128, np.array([65536, -32768, 65536])
+
+    def camera(position):
+        moved = matrix.copy()
+        moved[:3, 3] = position
+        return Camera(jnp.asarray(moved), jnp.asarray([0.8, 0.6]), jnp.zeros(2))
+
+    near_by, far_off = ((camera(origin + step), camera(origin)) for origin in (np.zeros(3), far))
+    for op in (ops.camera_motion, ops.previous_depth):
+        np.testing.assert_allclose(op(depth, *far_off), op(depth, *near_by), atol=1e-5)
+    points = jnp.asarray(matrix[:3, 2] * 2 + step, jnp.float32)
+    points = jnp.round(points * 128) / 128
+    found = ops.project(points + jnp.asarray(far, jnp.float32), far_off[1], (4, 6))
+    for value, expected in zip(found, ops.project(points, near_by[1], (4, 6)), strict=True):
+        np.testing.assert_allclose(value, expected, atol=1e-5)
+
+
 def test_behind_the_eye_is_outside_every_image():
     identity = Camera(jnp.eye(4), jnp.ones(2), jnp.zeros(2))
     points = jnp.asarray([[0.0, 0.0, -1.0], [0.0, 0.0, 0.0], [1.0, 1.0, 1e-9]])
