@@ -20,7 +20,8 @@ Names carry the unit or the space where there is doubt: `motion_px`, `depth_line
 `LAYERS` is the table of all buffers.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -94,6 +95,54 @@ class Frame(NamedTuple):
     """Factor on linear colour before the display tone map."""
     factor: Scale = Scale(1)
     """HR size divided by LR size, for the pytree; `scale` is the plain number."""
+
+    @classmethod
+    def of(
+        cls,
+        color: Any = None,
+        *,
+        depth: Any = None,
+        motion: Any = None,
+        jitter: Any = (0.0, 0.0),
+        reset: Any = False,
+        exposure: Any = 1.0,
+        lr: Mapping[str, Any] | None = None,
+        hr: Mapping[str, Any] | None = None,
+        camera: Camera | None = None,
+        rendered: bool = True,
+        scale: int | None = None,
+    ) -> "Frame":
+        """A frame of the arrays that one has, NumPy's or JAX's; what is left out is filled in.
+
+        Args:
+            color: the jittered LR render `[h, w, 3]`, scene-linear. Not needed if `rendered` is False.
+            depth: LR linear view depth `[h, w, 1]` or `[h, w]`, +inf for sky.
+            motion: LR backward motion `[h, w, 2]` in LR pixels, without jitter.
+            jitter: J (x, y) in LR pixels, each in [-0.5, 0.5].
+            reset: True where this frame does not continue the one before it.
+            exposure: factor on linear colour before the display tone map, above 0.
+            lr: further LR layers by name, such as `{"base_color": ..., "normal": ...}`.
+            hr: HR layers by name, such as `{"depth": ..., "motion": ...}`; motion in HR pixels.
+            camera: where it is known.
+            rendered: False for a frame that has only its G-buffers and is to be extrapolated.
+            scale: HR size over LR size, where the sizes of the arrays do not tell.
+
+        Raises:
+            JaxsrError: it names the argument, and says what was expected and found.
+        """
+        from jaxsr.frame_input import make_frame  # it needs this class
+
+        low = {"color": color, "depth": depth, "motion": motion}
+        return make_frame(
+            {k: v for k, v in low.items() if v is not None} | dict(lr or {}),
+            dict(hr or {}),
+            jitter=jitter,
+            exposure=exposure,
+            camera=camera,
+            reset=reset,
+            rendered=rendered,
+            scale=scale,
+        )
 
     @property
     def scale(self) -> int:

@@ -8,6 +8,9 @@ A new buffer is one row here and one field of `jaxsr.frames.GBuffer`.
 import math
 from typing import Literal, NamedTuple
 
+MAX_JITTER = 0.5 + 1e-4
+"""Largest jitter along an axis, in LR pixels: a frame shows no more than its own pixels."""
+
 
 class Layer(NamedTuple):
     """One row: a buffer of an image, or its colour."""
