@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from experiments.demo_results import BEGIN, END, picture, readme_block
+from jaxsr.data import analytic
+from jaxsr.frames import FIELDS
 from jaxsr.io.images import write_png
 from jaxsr.report.results import MethodResult, SequenceResult
 
@@ -96,15 +98,24 @@ def test_a_page_is_finished_and_its_links_lead_somewhere(page):
         assert (page.parent / target).exists(), target
 
 
-def test_the_example_of_readme_runs():
+def test_the_examples_of_readme_run():
+    import jax
     import jax.numpy as jnp
 
-    code = re.search(r"```python\n(.*?)```", README, re.S)
-    assert code
-    scope: dict = {}
-    exec(code.group(1), scope)  # our own page
-    image, confidence = scope["extrapolate"](
-        *(jnp.full((8, 8, 3), 0.5) for _ in range(5)), jnp.zeros((8, 8, 2))
-    )
-    assert image.shape == (8, 8, 3)
+    streaming, extrapolating = re.findall(r"```python\n(.*?)```", README, re.S)
+    frames = []
+    for t in range(2):
+        frame, truth = analytic.frame(t, (32, 24), 4, (0.25, -0.1))
+        lr, hr = ({n: getattr(g, f) for n, f in FIELDS.items()} for g in (frame.lr, frame.hr))
+        frames.append(lr | {"color": frame.color_linear, "jitter": (0.25, -0.1), "hr": hr})
+    scope: dict = {"frames": frames}
+    exec(streaming, scope)  # our own page
+    assert scope["image"].shape == (24, 32, 3)
+    assert float(jnp.mean(jnp.abs(scope["image"] - truth))) < 0.1
+
+    scope = {}
+    exec(extrapolating, scope)
+    gbuffer = jax.tree.map(jnp.asarray, frame.hr)
+    image, confidence = scope["extrapolate"](jnp.asarray(truth), gbuffer, gbuffer, jnp.zeros((24, 32, 2)))
+    np.testing.assert_allclose(image, truth, atol=0.1)
     assert float(confidence.min()) == 1.0
