@@ -117,5 +117,5 @@ def test_the_examples_of_readme_run():
     exec(extrapolating, scope)
     gbuffer = jax.tree.map(jnp.asarray, frame.hr)
     image, confidence = scope["extrapolate"](jnp.asarray(truth), gbuffer, gbuffer, jnp.zeros((24, 32, 2)))
-    np.testing.assert_allclose(image, truth, atol=0.1)
+    assert float(jnp.mean(jnp.abs(image - truth))) < 0.03  # its four best candidates lie side by side
     assert float(confidence.min()) == 1.0
