@@ -87,7 +87,7 @@ def color_of(lighting: Float[Array, "*b H W 3"], gbuffer: GBuffer, eps: float) -
 
 def keep(image: Float[Array, "H W 3"], frame: Frame) -> History:
     """The history after an output: the image and its HR surface, where the frame has one."""
-    return History(image, frame.hr.depth_linear, frame.hr.base_color, frame.hr.normal)
+    return History(image, frame.hr.depth_linear, frame.hr.base_color, frame.hr.normal, frame.camera)
 
 
 def reprojected(

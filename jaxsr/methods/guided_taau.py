@@ -40,7 +40,7 @@ class Options:
     eps: float = 0.02
     """Smallest base colour that the colour of a surface is divided by."""
     temporal: taau.Options = taau.Options(  # noqa: RUF009 (frozen)
-        kernel_sigma=0.5, sample_sigma=0.7, memory=2.0, box=1.0
+        kernel_sigma=0.5, sample_sigma=0.7, memory=2.0, box=1.0, light_tolerance=0.1
     )
     """The accumulation over time."""
 
@@ -72,13 +72,15 @@ def same_surface(gbuffer: GBuffer, options: Options) -> taau.Alike:
     return alike
 
 
+def samples(frame: Frame, options: Options) -> Float[Array, "h w 3"]:
+    """The LR lighting of a frame, in the working space of TAAU."""
+    return taau.to_working(guided.lighting_of(frame.color_linear, frame.lr, options.eps), frame.exposure)
+
+
 def estimate(frame: Frame, options: Options) -> taau.Estimate:
     """What one frame says of the lighting of each HR pixel, in the working space of TAAU."""
     lr = frame.lr
-    lighting = guided.lighting_of(frame.color_linear, lr, options.eps)
-    features = jnp.concatenate(
-        [taau.to_working(lighting, frame.exposure), guided.guide(lr), 1 / lr.depth_linear], -1
-    )
+    features = jnp.concatenate([samples(frame, options), guided.guide(lr), 1 / lr.depth_linear], -1)
     alike = same_surface(frame.hr, options)
     return taau.estimate(features, frame.jitter_px, frame.scale, options.temporal, alike)
 
@@ -103,8 +105,9 @@ def method(options: Options | None = None, reprojection: guided.Options | None =
         now = estimate(frame, o)
         lighting = guided.lighting_of(last.image, last.gbuffer, o.eps)
         before, weight = taau.fetch_history(
-            taau.to_working(lighting, frame.exposure), state.weight, last.depth_linear, frame, o.temporal
+            taau.to_working(lighting, frame.exposure), state, frame, o.temporal
         )
+        weight = weight * taau.same_light(samples(frame, o), before, weight, o.temporal)
         blended, weight = taau.accumulate(before, weight, now, o.temporal)
         image = guided.color_of(taau.from_working(blended, frame.exposure), frame.hr, o.eps)
         return taau.State(guided.keep(image, frame), weight), image

@@ -10,10 +10,17 @@ Jittered LR frames are accumulated into an HR history. Symbols:
     c       = sum_q k(d) I(q) / sum_q k(d),   k Gaussian of `kernel_sigma`
     beta    = max(max_q exp(-|s d|^2 / (2 sample_sigma^2)), floor): 1 where a sample falls on p
     h'      = h clipped to the box of the 3 x 3 samples in YCoCg
-    n'      = n times the bilinear share of the taps at p - MV_N(p) whose depth agrees: 0 in disocclusions
+    n'      = n times the bilinear share of the taps at p - MV_N(p) whose depth agrees: 0 in disocclusions;
+              times a factor that falls where the light has changed
     out     = (n' h' + beta c) / (n' + beta),   n <- min(n' + beta, memory)
 
 Equations are those of `jaxsr.ops.jitter`; motion says where to look, depth whether to trust what is there.
+A tap agrees if it has the depth that the point of p had in the previous view (`previous_depth`), as the two
+cameras tell; where a camera is not known, or the object moves, the depth that it has now will do as well.
+
+Light that changes is seen as a ratio of means: of the luma of the current samples, and of the history in the
+same block of LR pixels. Sampling noise averages out in each mean; in a mean of ratios it would not.
+
 The average is taken of exposed, tone-mapped colour (Reinhard), so that one bright sample does not flicker,
 and the unit of radiance does not matter. A frame
 that was not rendered is the history warped backward, unclipped: the plain warp that guided reprojection must
@@ -26,10 +33,11 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Frame
+from jaxsr.frames import Camera, Frame
 from jaxsr.methods.base import Method, Needs
 from jaxsr.methods.history import History, no_image
 from jaxsr.methods.options import check_options
@@ -40,7 +48,8 @@ from jaxsr.ops import (
     tone_map,
     ycocg_from_rgb,
 )
-from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid
+from jaxsr.ops.geometry import rotate, view_from_view, view_rays
+from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid, upsample
 
 
 @dataclass(frozen=True)
@@ -58,12 +67,16 @@ class Options:
     box: float = 1.25
     """Half-width of the clipping box, in units of the neighbourhood's."""
     depth_tolerance: float = 0.02
-    """Relative change of depth from frame to frame that counts as the same surface."""
+    """Relative difference from the predicted depth that counts as the same surface."""
+    light_block: int = 4
+    """Half the side of the blocks in which light is compared, in LR pixels."""
+    light_tolerance: float = 0.2
+    """Change of the mean luma of a block, as a natural logarithm, that halves the weight of the history."""
 
     def check(self) -> None:
         """Raise JaxsrError for an option out of range."""
         check_options(self)
-        for name in ("kernel_sigma", "sample_sigma", "floor", "memory"):
+        for name in ("kernel_sigma", "sample_sigma", "floor", "memory", "light_tolerance"):
             if not getattr(self, name) > 0:
                 raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=0)
 
@@ -79,7 +92,13 @@ class State(NamedTuple):
 def init(frame: Frame) -> State:
     """An empty history."""
     depth = jnp.zeros_like(frame.hr.depth_linear)
-    return State(History(no_image(frame), depth_linear=depth), depth)
+    camera = jax.tree.map(jnp.zeros_like, frame.camera)
+    return State(History(no_image(frame), depth_linear=depth, camera=camera), depth)
+
+
+def keep(image: Float[Array, "H W 3"], frame: Frame) -> History:
+    """The history after an output."""
+    return History(image, frame.hr.depth_linear, camera=frame.camera)
 
 
 def to_working(color_linear: Float[Array, "H W 3"], exposure: Float[Array, ""]) -> Float[Array, "H W 3"]:
@@ -181,10 +200,25 @@ def accumulate(
     return blended, jnp.minimum(weight + beta, options.memory)
 
 
+def previous_depth(
+    depth_linear: Float[Array, "H W 1"], camera: Camera | None, previous: Camera | None
+) -> Float[Array, "H W 1"]:
+    """The linear view depth that the point of each pixel had in the previous view, if it stood still.
+
+    Sky stays infinite. Without cameras it is the depth that the point has now.
+    """
+    if camera is None or previous is None:
+        return depth_linear
+    size = (depth_linear.shape[0], depth_linear.shape[1])
+    turn, shift = view_from_view(camera, previous)
+    solid = jnp.isfinite(depth_linear)
+    points = rotate(turn, view_rays(pixel_grid(*size), camera, size) * jnp.where(solid, depth_linear, 1.0))
+    return jnp.where(solid, points[..., 2:] + shift[2], jnp.inf)
+
+
 def fetch_history(
     history: Float[Array, "H W c"],
-    weight: Float[Array, "H W 1"],
-    previous_depth: Float[Array, "H W 1"],
+    state: State,
     frame: Frame,
     options: Options,
 ) -> tuple[Float[Array, "H W c"], Float[Array, "H W 1"]]:
@@ -194,15 +228,25 @@ def fetch_history(
     some do, so that nothing bleeds across a silhouette; weight 0 where none does or out of view. Depths are
     compared as 1 / depth, which is linear across a plane: the tolerance is `depth_tolerance` of it plus what
     the slope of the surface changes it by in one pixel.
+
+    Args:
+        history: the image of the state, in any space.
+        state: what it is worth, and the depth and the camera of its frame.
+        frame: the current one.
+        options: of TAAU.
     """
+    weight, before = state.weight, state.last
+    assert before.depth_linear is not None
     height, width, channels = history.shape
     motion = frame.hr.motion_px
     position = pixel_grid(height, width) - jnp.nan_to_num(motion)
     base = jnp.clip(jnp.floor(position), -2, jnp.array((width, height), motion.dtype)[None, None])
     fraction = position - base
     inverse = 1 / frame.hr.depth_linear
+    expected = previous_depth(frame.hr.depth_linear, frame.camera, before.camera)
+    expected = jnp.where(expected > 0, 1 / expected, inverse)  # it was behind the eye: no tap shows it
     tolerance = options.depth_tolerance * inverse + slope(inverse) + 1e-6
-    packed = jnp.concatenate([history, weight, 1 / previous_depth], -1)
+    packed = jnp.concatenate([history, weight, 1 / before.depth_linear], -1)
 
     weights_x = kernel_taps(fraction[..., :1], "bicubic")
     weights_y = jnp.stack(kernel_taps(fraction[..., 1:], "bicubic"))
@@ -220,7 +264,8 @@ def fetch_history(
             row = row + weights_x[i + 1] * tap[..., :channels]
             if i in (0, 1):
                 inside = ((at_x == x) & (at_y == y))[..., None]
-                agrees = inside & (jnp.abs(tap[..., -1:] - inverse) <= tolerance)
+                off = jnp.minimum(jnp.abs(tap[..., -1:] - expected), jnp.abs(tap[..., -1:] - inverse))
+                agrees = inside & (off <= tolerance)
                 hat_x = fraction[..., :1] if i else 1 - fraction[..., :1]
                 share = jnp.where(agrees, hat_x * hat_y, 0)
                 total, agreeing = total + share * tap[..., :-1], agreeing + share
@@ -236,6 +281,41 @@ def fetch_history(
     some = total / jnp.maximum(agreeing, 1e-6)
     # A few agreeing taps far from p are worth less than four around it.
     return jnp.where(agreeing > 0.999, sharp, some[..., :-1]), some[..., -1:] * agreeing
+
+
+def same_light(
+    samples: Float[Array, "h w 3"],
+    history: Float[Array, "H W 3"],
+    weight: Float[Array, "H W 1"],
+    options: Options,
+) -> Float[Array, "H W 1"]:
+    """How far the history still has the light of the current samples: 1 where it has, towards 0 elsewhere.
+
+    Args:
+        samples: of the current frame, in working space.
+        history: where the motion leads, in working space.
+        weight: of the history; where it is 0 the pixel does not count.
+        options: of TAAU.
+    """
+    h, w = samples.shape[:2]
+    scale = history.shape[0] // h
+    counts = ((weight > 0) & jnp.isfinite(history[..., :1])).astype(history.dtype)
+
+    def cells(x: Array) -> Array:  # the mean over the HR pixels of each LR pixel
+        return x.reshape(h, scale, w, scale, 1).mean((1, 3))
+
+    def blocks(x: Array) -> Array:
+        side = 2 * options.light_block + 1
+        x = jax.lax.reduce_window(x, np.zeros((), x.dtype), jax.lax.add, (side, 1, 1), (1, 1, 1), "SAME")
+        return jax.lax.reduce_window(x, np.zeros((), x.dtype), jax.lax.add, (1, side, 1), (1, 1, 1), "SAME")
+
+    share = cells(counts)
+    now = blocks(jnp.where(jnp.isfinite(samples[..., :1]), samples[..., :1], 0) * share)
+    then = blocks(cells(jnp.where(counts > 0, history[..., :1], 0)))
+    # The black level keeps the ratio of two dark blocks from being noise.
+    black = 0.01 * blocks(share) + 1e-6
+    change = jnp.log((now + black) / (then + black))
+    return upsample(jnp.exp2(-((change / options.light_tolerance) ** 2)), scale, "bilinear")
 
 
 def slope(inverse_depth: Float[Array, "H W 1"]) -> Float[Array, "H W 1"]:
@@ -270,23 +350,19 @@ def method(options: Options | None = None) -> Method:
         depth = frame.hr.depth_linear
         if frame.scale == 1:  # every pixel was sampled: nothing to accumulate
             image = frame.color_linear
-            return State(History(image, depth), jnp.full_like(depth, o.memory)), image
+            return State(keep(image, frame), jnp.full_like(depth, o.memory)), image
         color = to_working(frame.color_linear, frame.exposure)
         now = estimate(color, frame.jitter_px, frame.scale, o, _all_alike)
-        last = state.last
-        assert last.depth_linear is not None
-        history = to_working(last.image, frame.exposure)
-        before, weight = fetch_history(history, state.weight, last.depth_linear, frame, o)
+        before, weight = fetch_history(to_working(state.last.image, frame.exposure), state, frame, o)
+        weight = weight * same_light(color, before, weight, o)
         blended, weight = accumulate(before, weight, now, o)
         image = from_working(blended, frame.exposure)
-        return State(History(image, depth), weight), image
+        return State(keep(image, frame), weight), image
 
     def extrapolate(net: None, state: State, frame: Frame) -> tuple[State, Array]:
-        last = state.last
-        assert last.depth_linear is not None
-        image = backward_warp(last.image, frame.hr.motion_px, mode="bilinear")
-        _, weight = fetch_history(last.image[..., :0], state.weight, last.depth_linear, frame, o)
-        return State(History(image, frame.hr.depth_linear), weight), image
+        image = backward_warp(state.last.image, frame.hr.motion_px, mode="bilinear")
+        _, weight = fetch_history(state.last.image[..., :0], state, frame, o)
+        return State(keep(image, frame), weight), image
 
     geometry = frozenset({"hr.depth", "hr.motion"})
     return Method(
