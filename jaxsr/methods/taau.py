@@ -66,7 +66,7 @@ class Options:
     """Greatest weight of the history."""
     box: float = 1.25
     """Half-width of the clipping box, in units of the neighbourhood's."""
-    depth_tolerance: float = 0.02
+    depth_tolerance: float = 0.01
     """Relative difference from the predicted depth that counts as the same surface."""
     light_block: int = 4
     """Half the side of the blocks in which light is compared, in LR pixels."""
