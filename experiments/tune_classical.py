@@ -41,7 +41,6 @@ from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.methods import METHODS, Method, guided, guided_taau, taau
 from jaxsr.methods.base import step as step_of
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
-from jaxsr.runtime.schedule import observed
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -53,15 +52,18 @@ RESULTS = ROOT / "experiments" / "results"
 
 SIGMA_GUIDE = (0.01, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2, 0.3, 0.5)
 SIGMA_SPACE = (0.3, 0.4, 0.5, 0.6, 0.7, 0.85, 1.0, 1.4, 2.0, 4.0)
-TAAU_GRID: dict[str, tuple[float, ...]] = {
-    "kernel_sigma": (0.25, 0.35, 0.5, 0.7),
+TEMPORAL_GRID: dict[str, tuple[float, ...]] = {
     "sample_sigma": (0.25, 0.4, 0.55, 0.7, 1.0),
     "box": (0.75, 1.0, 1.25, 2.0),
     "memory": (0.5, 1.0, 2.0, 4.0, 8.0),
     "floor": (0.005, 0.02, 0.1),
-    "depth_tolerance": (0.01, 0.02, 0.03, 0.05),
+    "depth_tolerance": (0.005, 0.01, 0.02, 0.04),
+    "light_block": (2, 4, 8),
+    "light_tolerance": (0.05, 0.1, 0.2, 0.4),
 }
-GUIDED_GRID = {"sigma_guide": (0.1, 0.15, 0.2, 0.3, 0.4, 0.6)}
+KERNEL_GRID: dict[str, tuple[float, ...]] = {"kernel_sigma": (0.25, 0.35, 0.5, 0.7)}
+TAAU_GRID = KERNEL_GRID | TEMPORAL_GRID
+GUIDED_GRID = KERNEL_GRID | {"sigma_guide": (0.1, 0.15, 0.2, 0.3, 0.4, 0.6)}
 
 
 @dataclass(frozen=True)
@@ -182,14 +184,18 @@ def tune_taau(sequences: Sequence[FrameSequence], rounds: int) -> dict[str, Any]
     start = guided_taau.Options()
     temporal = coordinate_search(
         start.temporal,
-        TAAU_GRID,
+        TEMPORAL_GRID,
         lambda o: score(guided_taau.method(replace(start, temporal=o)), clips),
         rounds,
         "guided-taau",
     )
-    start = replace(start, temporal=taau.Options(**temporal["options"]))
+    start = replace(start, temporal=taau.Accumulation(**temporal["options"]))
     guide = coordinate_search(
-        start, GUIDED_GRID, lambda o: score(guided_taau.method(o), clips), 1, "guided-taau"
+        start.upsampling,
+        GUIDED_GRID,
+        lambda o: score(guided_taau.method(replace(start, upsampling=o)), clips),
+        1,
+        "guided-taau",
     )
     bilinear = score(METHODS["bilinear"], clips)
     return {

@@ -84,7 +84,7 @@ class Options:
     """Smallest base colour that the colour of a surface is divided by."""
     depth_octaves: float = DEPTH_OCTAVES
     """Ratio of depths, in octaves, that the network tells apart."""
-    estimate: guided_taau.Options = guided_taau.Options()  # noqa: RUF009 (frozen)
+    estimate: guided_taau.Upsampling = guided_taau.Upsampling()  # noqa: RUF009 (frozen)
     """Constants of the guided upsampling that `base="guided"` corrects."""
     reprojection: guided.Options = guided.Options()  # noqa: RUF009 (frozen)
     """Constants of guided reprojection, for frames that were not rendered."""

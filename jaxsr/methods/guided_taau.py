@@ -30,30 +30,45 @@ BUFFERS = frozenset(
 
 
 @dataclass(frozen=True)
-class Options:
-    """Constants, within 0.15 dB of the best that `experiments/tune_classical.py` finds."""
+class Upsampling:
+    """Constants of the joint bilateral upsampling of one frame, within 0.15 dB of the best that
+    `experiments/tune_classical.py` finds."""
 
+    kernel_sigma: float = 0.5
+    """Reconstruction kernel, in LR pixels."""
     sigma_guide: float = 0.3
     """Standard deviation of the difference of base colour and normal between an HR pixel and an LR sample."""
     depth_tolerance: float = 0.05
     """Relative difference of 1 / depth between an HR pixel and an LR sample of the same surface."""
     eps: float = 0.02
     """Smallest base colour that the colour of a surface is divided by."""
-    temporal: taau.Options = taau.Options(  # noqa: RUF009 (frozen)
-        kernel_sigma=0.5, sample_sigma=0.7, memory=2.0, box=1.0, light_tolerance=0.1
-    )
-    """The accumulation over time."""
 
     def check(self) -> None:
         """Raise JaxsrError for an option out of range."""
         check_options(self)
-        self.temporal.check()
-        for name in ("sigma_guide", "depth_tolerance", "eps"):
+        for name in ("kernel_sigma", "sigma_guide", "depth_tolerance", "eps"):
             if not getattr(self, name) > 0:
                 raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=0)
 
 
-def same_surface(gbuffer: GBuffer, options: Options) -> taau.Alike:
+@dataclass(frozen=True)
+class Options:
+    """Constants of the method."""
+
+    upsampling: Upsampling = Upsampling()
+    """Of each frame."""
+    temporal: taau.Accumulation = taau.Accumulation(  # noqa: RUF009 (frozen)
+        sample_sigma=0.7, memory=2.0, box=1.0, light_tolerance=0.1
+    )
+    """Over time."""
+
+    def check(self) -> None:
+        """Raise JaxsrError for an option out of range."""
+        self.upsampling.check()
+        self.temporal.check()
+
+
+def same_surface(gbuffer: GBuffer, options: Upsampling) -> taau.Alike:
     """How alike the surfaces of an HR pixel and of a sample are, from base colour, normal and 1 / depth."""
     inverse = 1 / gbuffer.depth_linear
     tolerance = options.depth_tolerance * inverse + 2 * taau.slope(inverse) + 1e-6
@@ -72,17 +87,29 @@ def same_surface(gbuffer: GBuffer, options: Options) -> taau.Alike:
     return alike
 
 
-def samples(frame: Frame, options: Options) -> Float[Array, "h w 3"]:
+def samples(frame: Frame, options: Upsampling) -> Float[Array, "h w 3"]:
     """The LR lighting of a frame, in the working space of TAAU."""
     return taau.to_working(guided.lighting_of(frame.color_linear, frame.lr, options.eps), frame.exposure)
 
 
-def estimate(frame: Frame, options: Options) -> taau.Estimate:
-    """What one frame says of the lighting of each HR pixel, in the working space of TAAU."""
+def estimate(frame: Frame, options: Upsampling, sample_sigma: float = 0.7) -> taau.Estimate:
+    """What one frame says of the lighting of each HR pixel, in the working space of TAAU.
+
+    Args:
+        frame: a rendered frame.
+        options: of the upsampling.
+        sample_sigma: only the confidence of the estimate depends on it.
+    """
     lr = frame.lr
     features = jnp.concatenate([samples(frame, options), guided.guide(lr), 1 / lr.depth_linear], -1)
-    alike = same_surface(frame.hr, options)
-    return taau.estimate(features, frame.jitter_px, frame.scale, options.temporal, alike)
+    return taau.estimate(
+        features,
+        frame.jitter_px,
+        frame.scale,
+        same_surface(frame.hr, options),
+        kernel_sigma=options.kernel_sigma,
+        sample_sigma=sample_sigma,
+    )
 
 
 def method(options: Options | None = None, reprojection: guided.Options | None = None) -> Method:
@@ -94,6 +121,7 @@ def method(options: Options | None = None, reprojection: guided.Options | None =
     o, r = options or Options(), reprojection or guided.Options()
     o.check()
     r.check()
+    u = o.upsampling
 
     def upscale(net: None, state: taau.State, frame: Frame) -> tuple[taau.State, Array]:
         if frame.scale == 1:
@@ -102,14 +130,14 @@ def method(options: Options | None = None, reprojection: guided.Options | None =
             return taau.State(guided.keep(image, frame), weight), image
         last = state.last
         assert last.depth_linear is not None
-        now = estimate(frame, o)
-        lighting = guided.lighting_of(last.image, last.gbuffer, o.eps)
+        now = estimate(frame, u, o.temporal.sample_sigma)
+        lighting = guided.lighting_of(last.image, last.gbuffer, u.eps)
         before, weight = taau.fetch_history(
             taau.to_working(lighting, frame.exposure), state, frame, o.temporal
         )
-        weight = weight * taau.same_light(samples(frame, o), before, weight, o.temporal)
+        weight = weight * taau.same_light(samples(frame, u), before, weight, o.temporal)
         blended, weight = taau.accumulate(before, weight, now, o.temporal)
-        image = guided.color_of(taau.from_working(blended, frame.exposure), frame.hr, o.eps)
+        image = guided.color_of(taau.from_working(blended, frame.exposure), frame.hr, u.eps)
         return taau.State(guided.keep(image, frame), weight), image
 
     return Method(

@@ -15,17 +15,10 @@ _FILTERS: dict[str, Any] = {
     "eps": 0.02,
     "depth_octaves": 16.0,
     "estimate": {
+        "kernel_sigma": 0.5,
         "sigma_guide": 0.3,
         "depth_tolerance": 0.05,
         "eps": 0.02,
-        "temporal": {
-            "kernel_sigma": 0.5,
-            "sample_sigma": 0.7,
-            "floor": 0.02,
-            "memory": 2.0,
-            "box": 1.0,
-            "depth_tolerance": 0.02,
-        },
     },
     "reprojection": {
         "sigma_guide": 0.15,

@@ -53,11 +53,9 @@ from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid, upsampl
 
 
 @dataclass(frozen=True)
-class Options:
-    """Constants of TAAU, within 0.15 dB of the best that `experiments/tune_classical.py` finds."""
+class Accumulation:
+    """Constants of the accumulation over time, within 0.1 dB of the best that was found."""
 
-    kernel_sigma: float = 0.35
-    """Reconstruction kernel, in LR pixels."""
     sample_sigma: float = 0.4
     """How near to a pixel a sample must fall to count in full, in HR pixels."""
     floor: float = 0.02
@@ -76,9 +74,23 @@ class Options:
     def check(self) -> None:
         """Raise JaxsrError for an option out of range."""
         check_options(self)
-        for name in ("kernel_sigma", "sample_sigma", "floor", "memory", "light_tolerance"):
+        for name in ("sample_sigma", "floor", "memory", "light_tolerance"):
             if not getattr(self, name) > 0:
                 raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=0)
+
+
+@dataclass(frozen=True)
+class Options(Accumulation):
+    """Constants of TAAU."""
+
+    kernel_sigma: float = 0.35
+    """Reconstruction kernel, in LR pixels."""
+
+    def check(self) -> None:
+        """Raise JaxsrError for an option out of range."""
+        super().check()
+        if not self.kernel_sigma > 0:
+            raise JaxsrError("bad kernel_sigma", where="kernel_sigma", expected="a number above 0", found=0)
 
 
 class State(NamedTuple):
@@ -126,13 +138,22 @@ Alike = Callable[[Float[Array, "H W g"]], Float[Array, "H W 1"]]
 
 
 def estimate(
-    image: Float[Array, "h w c"], jitter_px: Float[Array, "2"], scale: int, options: Options, alike: Alike
+    image: Float[Array, "h w c"],
+    jitter_px: Float[Array, "2"],
+    scale: int,
+    alike: Alike,
+    *,
+    kernel_sigma: float,
+    sample_sigma: float,
 ) -> Estimate:
     """Reduce the 3 x 3 LR samples around each HR pixel; samples outside the image repeat the border.
 
     Args:
         image: colour in working space, then whatever `alike` wants to see of a sample.
+        jitter_px: J in LR pixels.
+        scale: HR size over LR size.
         alike: log of how likely a sample is to show the surface of the pixel, at most 0.
+        kernel_sigma, sample_sigma: see `Options`.
     """
     (h, w), c = (image.shape[0] * scale, image.shape[1] * scale), 3
     y = (jnp.arange(h, dtype=image.dtype) + 0.5) / scale - 0.5 - jitter_px[1]
@@ -148,7 +169,7 @@ def estimate(
             yield line[:, columns], squared
 
     def log_kernel(squared: Array, log_alike: Array) -> Array:
-        return log_alike - squared / (2 * options.kernel_sigma**2)
+        return log_alike - squared / (2 * kernel_sigma**2)
 
     # Loops over rows, not unrolled sums: XLA would gather anew for every result that uses a sample.
     def most(best: tuple[Array, Array], j: Array) -> tuple[tuple[Array, Array], tuple[Array, ...]]:
@@ -169,7 +190,7 @@ def estimate(
             counts = log_alike >= best_alike - 3.0
             low = jnp.minimum(low, jnp.where(counts, values, jnp.inf))
             high = jnp.maximum(high, jnp.where(counts, values, -jnp.inf))
-            hit = jnp.exp(log_alike - squared * scale**2 / (2 * options.sample_sigma**2))
+            hit = jnp.exp(log_alike - squared * scale**2 / (2 * sample_sigma**2))
             confidence = jnp.maximum(confidence, hit)
         return (total, color, low, high, confidence), None
 
@@ -182,7 +203,7 @@ def estimate(
 
 
 def accumulate(
-    history: Float[Array, "H W 3"], weight: Float[Array, "H W 1"], now: Estimate, options: Options
+    history: Float[Array, "H W 3"], weight: Float[Array, "H W 1"], now: Estimate, options: Accumulation
 ) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 1"]]:
     """Blend the estimate of one frame into the history, which is worth `weight` (n'), in working space.
 
@@ -220,7 +241,7 @@ def fetch_history(
     history: Float[Array, "H W c"],
     state: State,
     frame: Frame,
-    options: Options,
+    options: Accumulation,
 ) -> tuple[Float[Array, "H W c"], Float[Array, "H W 1"]]:
     """The history at p - MV, from the taps that saw the same surface, and what it is worth.
 
@@ -287,7 +308,7 @@ def same_light(
     samples: Float[Array, "h w 3"],
     history: Float[Array, "H W 3"],
     weight: Float[Array, "H W 1"],
-    options: Options,
+    options: Accumulation,
 ) -> Float[Array, "H W 1"]:
     """How far the history still has the light of the current samples: 1 where it has, towards 0 elsewhere.
 
@@ -352,7 +373,14 @@ def method(options: Options | None = None) -> Method:
             image = frame.color_linear
             return State(keep(image, frame), jnp.full_like(depth, o.memory)), image
         color = to_working(frame.color_linear, frame.exposure)
-        now = estimate(color, frame.jitter_px, frame.scale, o, _all_alike)
+        now = estimate(
+            color,
+            frame.jitter_px,
+            frame.scale,
+            _all_alike,
+            kernel_sigma=o.kernel_sigma,
+            sample_sigma=o.sample_sigma,
+        )
         before, weight = fetch_history(to_working(state.last.image, frame.exposure), state, frame, o)
         weight = weight * same_light(color, before, weight, o)
         blended, weight = accumulate(before, weight, now, o)

@@ -444,7 +444,7 @@ def test_untrained_it_is_the_guided_upsampling(monkeypatch):
     for t in range(2):
         frame = frame_at(t)[0]._replace(exposure=jnp.asarray(1.5))
         _, image = step_of("default")(net, method_of("default").init(frame), frame)
-        color = guided_taau.estimate(frame, guided_taau.Options()).color
+        color = guided_taau.estimate(frame, guided_taau.Upsampling()).color
         estimate = taau.from_working(color, frame.exposure)
         expected = guided.color_of(estimate, frame.hr, 0.02)
         np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)

@@ -9,10 +9,11 @@ import pytest
 
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Frame
+from jaxsr.frames import Camera, Frame
 from jaxsr.methods import METHODS, taau
 from jaxsr.methods.base import step
-from jaxsr.ops import jitter_sequence, to_display
+from jaxsr.methods.history import History
+from jaxsr.ops import camera_motion, jitter_sequence, project, to_display, upsample, world_position
 from jaxsr.runtime.stream import stream
 
 SIZE = (96, 54)
@@ -171,7 +172,8 @@ def test_taau_history_does_not_bleed_across_a_silhouette():
     here = frame._replace(
         hr=frame.hr._replace(depth_linear=depth, motion_px=motion), reset=jnp.asarray(False)
     )
-    history, weight = taau.fetch_history(image, jnp.ones((h, w, 1)), depth, here, taau.Options())
+    state = taau.State(History(image, depth), jnp.ones((h, w, 1)))
+    history, weight = taau.fetch_history(image, state, here, taau.Options())
     right_edge = history[1:, w // 2]  # its left tap lies on the near surface
     np.testing.assert_allclose(right_edge, 5.0, rtol=1e-6)
     assert (weight[1:, w // 2] < 1).all()
@@ -256,8 +258,77 @@ def test_history_counts_for_nothing_in_disocclusions(change):
     motion = jnp.full((h, w, 2), {"depth": 0.25, "motion": 300.0, "infinite motion": jnp.inf}[change])
     here = frame._replace(hr=frame.hr._replace(depth_linear=depth, motion_px=motion))
     image, before = jnp.ones((h, w, 3)), depth * (2 if change == "depth" else 1)
-    _, weight = taau.fetch_history(image, jnp.ones((h, w, 1)), before, here, taau.Options())
+    state = taau.State(History(image, before), jnp.ones((h, w, 1)))
+    _, weight = taau.fetch_history(image, state, here, taau.Options())
     np.testing.assert_allclose(weight, 0.0, atol=1e-6)
+
+
+def walk(step, known=True):
+    """A frame of a camera that walks towards a wall, and the state of the frame before it.
+
+    The wall is 10 units away, then `10 (1 - step)`; both are seen head-on.
+    """
+    frame = jax.tree.map(jnp.asarray, clip(2, 2)[0][1])
+    h, w = frame.hr.depth_linear.shape[:2]
+    before = Camera(jnp.eye(4), jnp.array([0.6, 0.4]), jnp.zeros(2))
+    now = before._replace(world_from_view=jnp.eye(4).at[2, 3].set(10 * step))
+    depth, far = jnp.full((h, w, 1), 10 * (1 - step)), jnp.full((h, w, 1), 10.0)
+    hr = frame.hr._replace(depth_linear=depth, motion_px=camera_motion(depth, now, before))
+    state = taau.State(
+        History(jnp.ones((h, w, 3)), far, camera=before if known else None), jnp.ones((h, w, 1))
+    )
+    return frame._replace(hr=hr, camera=now if known else None), state
+
+
+@pytest.mark.parametrize("step", [0.005, 0.03, 0.2, 0.5, -0.5])
+def test_a_camera_that_walks_towards_a_wall_keeps_its_history(step):
+    frame, state = walk(step)
+    _, weight = taau.fetch_history(state.last.image, state, frame, taau.Options())
+    inside = slice(16, -16), slice(28, -28)  # walking backwards, the border comes into view
+    np.testing.assert_allclose(weight[inside], 1.0, atol=1e-5)
+    if step > 0.02:  # nothing but the camera tells
+        frame, state = walk(step, known=False)
+        _, weight = taau.fetch_history(state.last.image, state, frame, taau.Options())
+        np.testing.assert_allclose(weight, 0.0, atol=1e-6)
+
+
+def test_the_depth_before_is_that_of_the_point_in_space():
+    frames, _ = clip(2, 3)
+    frame, before = (jax.tree.map(jnp.asarray, f) for f in frames[2:0:-1])
+    depth = taau.previous_depth(frame.hr.depth_linear, frame.camera, before.camera)
+    points = world_position(frame.hr.depth_linear, frame.camera)
+    _, expected = project(points, before.camera, SIZE[::-1])
+    solid = np.isfinite(frame.hr.depth_linear)
+    np.testing.assert_allclose(depth[solid], expected[solid], rtol=1e-5)
+    assert np.isinf(np.asarray(depth)[~solid]).all()
+    assert (~solid).any()
+    gradient = jax.grad(
+        lambda d: jnp.where(solid, taau.previous_depth(d, frame.camera, before.camera), 0.0).sum()
+    )(frame.hr.depth_linear)
+    assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("factor", [0.25, 0.9, 1.0, 1.1, 4.0])
+def test_light_that_changes_is_a_ratio_of_means(factor):
+    """Against loops over the blocks; noise of the samples averages out."""
+    rng = np.random.default_rng(0)
+    options = taau.Options(light_block=1, light_tolerance=0.2)
+    samples = rng.random((4, 6, 3)).astype(np.float32)
+    history = np.repeat(np.repeat(samples, 2, 0), 2, 1) * np.float32(factor)
+    weight = (rng.random((8, 12, 1)) > 0.3).astype(np.float32)
+    share = weight.reshape(4, 2, 6, 2).mean((1, 3))
+    expected = np.zeros((4, 6, 1), np.float32)
+    for y in range(4):
+        for x in range(6):
+            block = slice(max(y - 1, 0), y + 2), slice(max(x - 1, 0), x + 2)
+            now = (samples[..., 0] * share)[block].sum()
+            black = 0.01 * share[block].sum() + 1e-6
+            change = np.log((now + black) / (factor * now + black))
+            expected[y, x] = 2 ** -((change / 0.2) ** 2)
+    light = taau.same_light(*map(jnp.asarray, (samples, history, weight)), options)
+    np.testing.assert_allclose(light, upsample(jnp.asarray(expected), 2, "bilinear"), atol=1e-5)
+    nothing = taau.same_light(jnp.asarray(samples), jnp.asarray(history), jnp.zeros((8, 12, 1)), options)
+    assert np.isfinite(nothing).all()  # no history: nothing to compare with
 
 
 def test_the_slope_of_one_row_is_that_of_its_columns():
