@@ -14,9 +14,11 @@ BELOW = {
     "progress": {"errors"},
     "provenance": {"errors", "files"},
     "layers": {"errors"},
-    "frames": {"errors", "layers"},
     "srgb": set(),
     "ops": {"errors", "frames", "layers", "srgb"},
+    # `Frame.of` is written in a file of its own: the two are one part.
+    "frames": {"errors", "layers", "frame_input"},
+    "frame_input": {"errors", "layers", "frames"},
     "nets": {"ops", *GROUND},
     "losses": {"nets", "ops", *GROUND},
     "metrics": {"losses", "nets", "ops", *GROUND},

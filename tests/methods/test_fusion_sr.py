@@ -423,7 +423,7 @@ def test_settings_of_another_version_are_named():
     del settings["eps"]
     with pytest.raises(JaxsrError, match=r"a\.b: the setting 'eps' is missing; expected architecture"):
         build("fusion-sr", settings, "a.b")
-    settings = settings | {"eps": 0.02, "estimate": settings["estimate"] | {"temporal": {"floor": 1.0}}}
+    settings = settings | {"eps": 0.02, "estimate": {"sigma_guide": 0.3}}
     with pytest.raises(JaxsrError, match=r"a\.b: the setting 'kernel_sigma' is missing"):
         build("fusion-sr", settings, "a.b")
 

@@ -208,13 +208,13 @@ def test_a_file_holds_all_that_its_output_depends_on(tmp_path, monkeypatch):
         {"eps": 0.05},
         {"depth_octaves": 8.0},
         {"estimate": estimate | {"sigma_guide": 0.25}},
-        {"estimate": estimate | {"temporal": estimate["temporal"] | {"kernel_sigma": 0.25}}},
+        {"estimate": estimate | {"kernel_sigma": 0.25}},
         {"reprojection": head["settings"]["reprojection"] | {"sigma_guide": 0.5}},
     ):
         other = tmp_path / "other.safetensors"
         save_weights(other, arrays, head | {"settings": head["settings"] | settings})
         assert program(find_method(str(other), 2).method, loaded.net) != before, settings
-    changed(monkeypatch, guided_taau.Options.__init__, sigma_guide=0.25, depth_tolerance=0.1, eps=0.05)
+    changed(monkeypatch, guided_taau.Upsampling.__init__, sigma_guide=0.25, depth_tolerance=0.1, eps=0.05)
     changed(monkeypatch, taau.Options.__init__, kernel_sigma=0.2, floor=0.1, box=3.0)
     changed(monkeypatch, guided.Options.__init__, sigma_guide=0.5, sigma_space=9.0, strides=(1,), eps=0.05)
     changed(monkeypatch, fusion_sr.Options.__init__, eps=0.05, depth_octaves=8.0, base="none")
