@@ -15,16 +15,15 @@ Jittered LR frames are accumulated into an HR history. Symbols:
     out     = (n' h' + beta c) / (n' + beta),   n <- min(n' + beta, memory)
 
 Equations are those of `jaxsr.ops.jitter`; motion says where to look, depth whether to trust what is there.
-A tap agrees if it has the depth that the point of p had in the previous view (`previous_depth`), as the two
-cameras tell; where a camera is not known, or the object moves, the depth that it has now will do as well.
+A tap agrees if it has the depth that the point of p had in the previous view (`jaxsr.ops.previous_depth`), as
+the two cameras tell. Where a camera is not known, or the object moves, its present depth will do as well.
 
 Light that changes is seen as a ratio of means: of the luma of the current samples, and of the history in the
 same block of LR pixels. Sampling noise averages out in each mean; in a mean of ratios it would not.
 
 The average is taken of exposed, tone-mapped colour (Reinhard), so that one bright sample does not flicker,
-and the unit of radiance does not matter. A frame
-that was not rendered is the history warped backward, unclipped: the plain warp that guided reprojection must
-beat.
+and the unit of radiance does not matter. A frame that was not rendered is the history warped backward,
+unclipped: the plain warp that guided reprojection must beat.
 """
 
 from collections.abc import Callable, Iterator
@@ -37,18 +36,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Camera, Frame
+from jaxsr.frames import Frame
 from jaxsr.methods.base import Method, Needs
 from jaxsr.methods.history import History, no_image
 from jaxsr.methods.options import check_options
 from jaxsr.ops import (
     backward_warp,
     inverse_tone_map,
+    previous_depth,
     rgb_from_ycocg,
     tone_map,
     ycocg_from_rgb,
 )
-from jaxsr.ops.geometry import rotate, view_from_view, view_rays
 from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid, upsample
 
 
@@ -221,22 +220,6 @@ def accumulate(
     return blended, jnp.minimum(weight + beta, options.memory)
 
 
-def previous_depth(
-    depth_linear: Float[Array, "H W 1"], camera: Camera | None, previous: Camera | None
-) -> Float[Array, "H W 1"]:
-    """The linear view depth that the point of each pixel had in the previous view, if it stood still.
-
-    Sky stays infinite. Without cameras it is the depth that the point has now.
-    """
-    if camera is None or previous is None:
-        return depth_linear
-    size = (depth_linear.shape[0], depth_linear.shape[1])
-    turn, shift = view_from_view(camera, previous)
-    solid = jnp.isfinite(depth_linear)
-    points = rotate(turn, view_rays(pixel_grid(*size), camera, size) * jnp.where(solid, depth_linear, 1.0))
-    return jnp.where(solid, points[..., 2:] + shift[2], jnp.inf)
-
-
 def fetch_history(
     history: Float[Array, "H W c"],
     state: State,
@@ -264,7 +247,9 @@ def fetch_history(
     base = jnp.clip(jnp.floor(position), -2, jnp.array((width, height), motion.dtype)[None, None])
     fraction = position - base
     inverse = 1 / frame.hr.depth_linear
-    expected = previous_depth(frame.hr.depth_linear, frame.camera, before.camera)
+    expected = frame.hr.depth_linear
+    if frame.camera is not None and before.camera is not None:
+        expected = previous_depth(expected, frame.camera, before.camera)
     expected = jnp.where(expected > 0, 1 / expected, inverse)  # it was behind the eye: no tap shows it
     tolerance = options.depth_tolerance * inverse + slope(inverse) + 1e-6
     packed = jnp.concatenate([history, weight, 1 / before.depth_linear], -1)

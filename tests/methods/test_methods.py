@@ -13,7 +13,7 @@ from jaxsr.frames import Camera, Frame
 from jaxsr.methods import METHODS, taau
 from jaxsr.methods.base import step
 from jaxsr.methods.history import History
-from jaxsr.ops import camera_motion, jitter_sequence, project, to_display, upsample, world_position
+from jaxsr.ops import camera_motion, jitter_sequence, to_display, upsample
 from jaxsr.runtime.stream import stream
 
 SIZE = (96, 54)
@@ -290,22 +290,6 @@ def test_a_camera_that_walks_towards_a_wall_keeps_its_history(step):
         frame, state = walk(step, known=False)
         _, weight = taau.fetch_history(state.last.image, state, frame, taau.Options())
         np.testing.assert_allclose(weight, 0.0, atol=1e-6)
-
-
-def test_the_depth_before_is_that_of_the_point_in_space():
-    frames, _ = clip(2, 3)
-    frame, before = (jax.tree.map(jnp.asarray, f) for f in frames[2:0:-1])
-    depth = taau.previous_depth(frame.hr.depth_linear, frame.camera, before.camera)
-    points = world_position(frame.hr.depth_linear, frame.camera)
-    _, expected = project(points, before.camera, SIZE[::-1])
-    solid = np.isfinite(frame.hr.depth_linear)
-    np.testing.assert_allclose(depth[solid], expected[solid], rtol=1e-5)
-    assert np.isinf(np.asarray(depth)[~solid]).all()
-    assert (~solid).any()
-    gradient = jax.grad(
-        lambda d: jnp.where(solid, taau.previous_depth(d, frame.camera, before.camera), 0.0).sum()
-    )(frame.hr.depth_linear)
-    assert np.isfinite(gradient).all()
 
 
 @pytest.mark.parametrize("factor", [0.25, 0.9, 1.0, 1.1, 4.0])
