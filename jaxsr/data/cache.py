@@ -1,14 +1,15 @@
 """Sequences as memory-mapped arrays: decoding OpenEXR costs far more than a training step's crop of it.
 
 Each resolution of a sequence ("hr", "x2", ...) is converted once, when it is first asked for, to one file
-`[N, H, W, C]` a layer in the type of the OpenEXR channels, under
+`[N, H, W, C]` per layer in the type of the OpenEXR channels, under
 
     <cache>/<name of the folder>-<hash of its path>/<resolution>-<key>/   color.npy depth.npy ... arrays.json
 
 The key is made of the bytes of `sequence.json` and the sizes and times of the frames' files: a sequence that
 was changed is converted again, and what was made of its earlier state is deleted. A conversion is written
 under a temporary name and renamed when it is whole; processes that convert the same one at the same time do
-not disturb each other. Pixels are checked as `Sequence` does. Positions are not kept: no frame has them.
+not disturb each other. Pixels are checked as `Sequence` does, but a bad layer stops only those who need it:
+`arrays.json` keeps what is wrong with it. Positions are not kept: no frame has them.
 """
 
 import contextlib
@@ -25,12 +26,13 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_folder, read_json, remove_leftovers
+from jaxsr.io.description import check_pixels
 from jaxsr.io.sequence import Sequence
 from jaxsr.io.writing import frame_file
 from jaxsr.layers import LAYERS
 from jaxsr.progress import Progress, silent
 
-_VERSION = 1
+_VERSION = 2
 _WORKERS = 4
 
 
@@ -43,6 +45,8 @@ class Arrays(NamedTuple):
     """Layer -> `[N, H, W, C]`, read-only, of float16, float32 or uint32; read from disk as it is touched."""
     absent: dict[str, int]
     """Layer that some frames have and others lack -> the number of the first frame that lacks it."""
+    broken: dict[str, dict[str, str]]
+    """Layer with values that cannot be meant -> what is wrong, as arguments of `JaxsrError`."""
 
 
 def default_cache() -> Path:
@@ -112,7 +116,7 @@ def _open(seq: Sequence, resolution: str, home: Path, progress: Progress) -> Arr
     try:
         head = read_json(folder / "arrays.json", dict)
         layers = {n: _map(folder / f"{n}.npy") for n in head["layers"]}
-        return Arrays(seq, resolution, layers, head["absent"])
+        return Arrays(seq, resolution, layers, head["absent"], head["broken"])
     except (OSError, ValueError, KeyError, TypeError) as e:
         fix = "delete that folder: it is made again"
         raise JaxsrError("the arrays of a sequence cannot be read", where=folder, found=e, fix=fix) from e
@@ -128,9 +132,12 @@ def _convert(seq: Sequence, resolution: str, key: str, folder: Path, progress: P
     fix = "make room, or choose another folder for the cache"
     with atomic_folder(folder, fix) as temporary, contextlib.ExitStack() as stack:
         files = {n: stack.enter_context(_LayerFile(temporary / f"{n}.npy", len(seq))) for n in LAYERS}
+        broken: dict[str, dict[str, str]] = {}
         for i, layers in enumerate(_frames(seq, resolution)):
             for name, pixels in layers.items():
                 files[name].append(i, pixels)
+                if name not in broken and (wrong := _wrong(seq, resolution, i, name, pixels)):
+                    broken[name] = wrong
             advance()
         for file in files.values():
             file.close()
@@ -147,9 +154,21 @@ def _convert(seq: Sequence, resolution: str, key: str, folder: Path, progress: P
             "source": str(seq.path.resolve()),
             "layers": whole,
             "absent": {n: seq.infos[f.count].index for n, f in files.items() if f.seen and n not in whole},
+            "broken": broken,
             "sequence": read_json(seq.path / "sequence.json"),
         }
         (temporary / "arrays.json").write_text(json.dumps(head, indent=1), encoding="utf-8")
+
+
+def _wrong(seq: Sequence, resolution: str, i: int, layer: str, pixels: np.ndarray) -> dict[str, str]:
+    """What is wrong with the pixels of a layer, as arguments of `JaxsrError`; empty if nothing is."""
+    index = seq.infos[i].index
+    try:
+        check_pixels(layer, pixels, frame_file(seq.path, resolution, index), f"frame {index}: ")
+    except JaxsrError as error:
+        parts = {"what": error.what, "where": error.where, "expected": error.expected, "found": error.found}
+        return {name: str(value) for name, value in parts.items()}
+    return {}
 
 
 def _frames(seq: Sequence, resolution: str) -> Iterator[dict[str, np.ndarray]]:

@@ -173,6 +173,11 @@ def _starts(clip: Clip, length: int, held_back: int) -> list[int]:
 
 
 def _check_layer(arrays: Arrays, layer: str, need: str) -> None:
+    if wrong := arrays.broken.get(layer):
+        what, where = wrong["what"], wrong["where"]
+        expected, found = wrong["expected"], wrong["found"]
+        fix = "render it again, or leave the sequence out"
+        raise JaxsrError(what, where=where, expected=expected, found=found, fix=fix)
     if layer in arrays.layers:
         return
     frame = "" if layer not in arrays.absent else f" in frame {arrays.absent[layer]}"

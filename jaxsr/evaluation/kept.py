@@ -131,7 +131,7 @@ def _check_record(path: Path) -> None:
 def _load(record: Path, key: Mapping[str, Any], images: list[Path], flips: list[Path]) -> MethodResult | None:
     """The result of a record, if it is finished, has this key, and its pictures are there."""
     try:
-        read = json.loads(record.read_text(encoding="utf-8"))
+        read = read_json(record, dict)
         if read["key"] != json.loads(json.dumps(json_value(key))) or not all(p.is_file() for p in images):
             return None
         result = read["result"]

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from jaxsr.data.cache import default_cache, open_arrays
+from jaxsr.data.windows import WindowSource
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.layers import LAYERS
@@ -167,15 +168,22 @@ def test_two_at_the_same_time_do_not_disturb_each_other(tmp_path):
 
 
 @pytest.mark.parametrize(("layer", "value"), [("color", np.nan), ("depth", -np.inf), ("normal", np.inf)])
-def test_bad_pixels_are_named_and_leave_nothing(tmp_path, layer, value):
+def test_bad_pixels_stop_only_those_who_need_them(tmp_path, layer, value):
     seq = make_sequence(tmp_path / "s", **SMALL)
     file = seq.path / "hr/0003.exr"
     channels, _ = read_exr(file)
     channels[f"{layer}.{LAYERS[layer].letters[0]}"][1, 2] = value
     write_exr(file, channels)
+    arrays = open_arrays(seq.path, ("hr",), cache=tmp_path / "cache")["hr"]
+    assert list(arrays.broken) == [layer]
+
+    def windows(*needs):
+        return WindowSource([seq.path], scale=1, needs=frozenset(needs), cache=tmp_path / "cache")
+
     with pytest.raises(JaxsrError, match=rf"0003.exr: frame 3: layer '{layer}' .* x=2 y=1"):
-        open_arrays(seq.path, ("hr",), cache=tmp_path / "cache")
-    assert not list((tmp_path / "cache").glob("*/*"))
+        windows(f"lr.{layer}")
+    if layer != "color":  # it is the truth, which is always needed
+        assert len(windows("lr.color", "hr.roughness")) == 3
 
 
 def test_sky_is_no_bad_pixel(tmp_path):
