@@ -227,12 +227,29 @@ def test_jit_and_batch():
     assert_jit_and_batch(lambda *a: reproject(*a, **SIGMAS, strides=(1,)), *batch)
 
 
+def test_a_pixel_without_a_guide_needs_no_colour():
+    """Fewer candidates count than are kept: the others have no weight, and their NaN must not be seen."""
+    previous = jnp.ones((1, 3, 2)).at[0, 2].set(jnp.nan)
+    flat, still = jnp.zeros((1, 3, 1)), jnp.zeros((1, 3, 2))
+    guide = flat.at[0, 2].set(jnp.nan)
+
+    def total(previous):
+        image, confidence = reproject(previous, still, flat, guide, strides=(1,), count=9)
+        return image.sum(), (image, confidence)
+
+    (_, (image, confidence)), gradient = jax.value_and_grad(total, has_aux=True)(previous)
+    np.testing.assert_allclose(image, 1)
+    assert (confidence > 0).all()
+    np.testing.assert_array_equal(gradient[0, 2], 0)
+    np.testing.assert_allclose(gradient.sum(), 6, rtol=1e-6)
+
+
 def test_memory_stays_far_below_a_gather_of_all_candidates():
     # Also guards the speed: where the compiler copies the selection into its readers, memory shows it first.
     inputs = _inputs(20, 64, 96, g=6)
     compiled = jax.jit(reproject).lower(*inputs).compile()
     temporary = compiled.memory_analysis().temp_size_in_bytes / (64 * 96)
-    assert temporary < 250  # bytes a pixel, 100 of them the padding; all candidates' guides alone are 800
+    assert temporary < 250  # bytes per pixel, 100 of them the padding; all candidates' guides alone are 800
 
 
 def test_half_precision_values_stay():
