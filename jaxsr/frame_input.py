@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import FIELDS, LAYERS, Camera, Frame, GBuffer, Scale
-from jaxsr.layers import MAX_JITTER
+from jaxsr.layers import MAX_JITTER, RIGID_TOLERANCE
 
 Images = Mapping[str, Any]
 
@@ -194,13 +194,16 @@ def _camera(camera: Camera, dtype: Any) -> Camera:
                 "wrong shape", where=f"Frame.of, camera {name}", expected=list(shape), found=list(np.shape(x))
             )
         values[name] = x
-    rotation = values["world_from_view"][:3, :3]
-    if _known(rotation) and not np.allclose(rotation.T @ rotation, np.eye(3), atol=1e-3):
-        raise JaxsrError(
-            "the camera is not rigid",
-            where="Frame.of, camera world_from_view",
-            expected="a rotation and a translation",
-            found=np.asarray(rotation).tolist(),
-            fix="take scale out of the matrix",
-        )
+    matrix = values["world_from_view"]
+    if _known(matrix):
+        rotation = matrix[:3, :3]
+        off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max())
+        if not off <= RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+            raise JaxsrError(
+                "the camera is not rigid",
+                where="Frame.of, camera world_from_view",
+                expected="a rotation and a translation, without scale or mirror image; last row 0 0 0 1",
+                found=matrix.tolist(),
+                fix="take the scale out of the matrix",
+            )
     return Camera(**values)  # type: ignore[arg-type]

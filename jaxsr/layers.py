@@ -9,7 +9,9 @@ import math
 from typing import Literal, NamedTuple
 
 MAX_JITTER = 0.5 + 1e-4
-"""Largest jitter along an axis, in LR pixels: a frame shows no more than its own pixels."""
+"""Largest jitter along an axis, in LR pixels; a little more than half a pixel, for rounding."""
+RIGID_TOLERANCE = 1e-3
+"""How far the entries of R'R may be from those of the identity, R the rotation of a camera."""
 
 
 class Layer(NamedTuple):

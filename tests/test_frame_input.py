@@ -107,7 +107,9 @@ SCALED = Camera(2 * np.eye(4), np.ones(2), np.zeros(2))
         ({"exposure": 0.0}, "bad exposure"),
         ({"exposure": np.inf}, "bad exposure"),
         ({"reset": "false"}, "bad reset; expected True or False; found false"),
-        ({"camera": SCALED}, "the camera is not rigid.*take scale out"),
+        ({"camera": SCALED}, "the camera is not rigid.*take the scale out"),
+        ({"camera": SCALED._replace(world_from_view=np.diag([1.0, -1, 1, 1]))}, "not rigid.*mirror image"),
+        ({"camera": SCALED._replace(world_from_view=np.full((4, 4), np.nan))}, "the camera is not rigid"),
         (
             {"camera": Camera(np.eye(3), np.ones(2), np.zeros(2))},
             r"wrong shape; expected \[4, 4\]",

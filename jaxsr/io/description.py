@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.layers import LAYERS
+from jaxsr.layers import LAYERS, MAX_JITTER, RIGID_TOLERANCE
 
 if TYPE_CHECKING:
     from jaxsr.frames import Camera
@@ -27,10 +27,6 @@ READABLE = (1, 2)
 MAX_SIDE = 65536
 """Pixels of a side of the HR image at most."""
 MAX_INDEX = 2**31 - 1
-JITTER_LIMIT = 0.5 + 1e-4
-"""LR pixels; a little more than half a pixel, for rounding."""
-RIGID_TOLERANCE = 1e-3
-"""How far the entries of R'R may be from those of the identity, and the last row from 0 0 0 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,7 +201,7 @@ def check_info(info: FrameInfo, where: object, conventions: bool = True) -> None
     _check_scalars(info.index, info.reset, info.exposure, where)
     name = f"frame {info.index}"
     jitter = _finite(info.jitter_px, (2,), f"{name}: bad jitter_px", where)
-    if conventions and np.abs(jitter).max() > JITTER_LIMIT:
+    if conventions and np.abs(jitter).max() > MAX_JITTER:
         raise JaxsrError(
             f"{name}: jitter of more than half a pixel",
             where=where,
