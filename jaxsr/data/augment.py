@@ -1,7 +1,8 @@
 """Crops and flips of whole windows, NumPy: what is left obeys `jaxsr.frames` as if rendered that way.
 
 Nothing is done to colours: exposure and noise are what the renderer made them. Arrays are `[T, ...]` (any
-leading axes); images come back as views wherever no number changes.
+leading axes); images come back as views wherever no number changes. What is None (buffers, the camera, the LR
+truth) stays None.
 
 A crop narrows the camera's field of view and moves its axis. A flip shows the mirrored scene. To keep
 `world_from_view` a rigid transform the world is mirrored, too: with M the mirror of the image axis in view
@@ -71,6 +72,7 @@ def crop(window: Window, x: int, y: int, size: tuple[int, int]) -> Window:
             camera=camera,
         ),
         cut_out(1)(window.truth_linear),
+        None if window.lr_truth_linear is None else cut_out(scale)(window.lr_truth_linear),
     )
 
 
@@ -106,6 +108,7 @@ def flip(window: Window, *, horizontal: bool = False, vertical: bool = False) ->
             camera=camera,
         ),
         mirrored(window.truth_linear),
+        None if window.lr_truth_linear is None else mirrored(window.lr_truth_linear),
     )
 
 

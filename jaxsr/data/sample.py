@@ -4,6 +4,7 @@ It is stored as one archive per scene (`jaxsr.io.archive`), since OpenEXR would 
 and is unpacked to ordinary sequences where it is used. docs/data_card.md describes it.
 """
 
+import hashlib
 import importlib.resources
 from pathlib import Path
 from typing import Any
@@ -101,3 +102,19 @@ def _is_whole(folder: Path, head: dict[str, Any]) -> bool:
     indices = [info.index for info in found.infos]
     expected = [frame["index"] for frame in head["frames"]]
     return (indices, list(found.size), list(found.scales)) == (expected, head["size"], head["scales"])
+
+
+def unpack_to_cache(
+    cache: Path, split: str, scale: int | None = None, progress: Progress = silent
+) -> list[Path]:
+    """Unpack a split of the sample below the folder `cache`, once for each release of the sample.
+
+    Returns:
+        The folders, one per sequence.
+
+    Raises:
+        JaxsrError: as `unpack_sample`.
+    """
+    archives = (path.read_bytes() for path in sorted(sample_folder().glob("*.jsrz.sha256")))
+    folder = cache / f"sample-{hashlib.sha256(b''.join(archives)).hexdigest()[:12]}"
+    return unpack_sample(folder, split, scale=scale, progress=progress)

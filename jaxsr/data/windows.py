@@ -1,8 +1,9 @@
 """Windows of consecutive frames over many sequences, as a random-access source for Grain.
 
-A window is not read when it is made: its images are views of memory maps (`jaxsr.data.cache`) in the types
-of the files, and cropping and flipping (`jaxsr.data.augment`) give views again. `stack`, which makes a batch,
-touches the pixels that are left, once, and turns them into float32.
+Making a window reads no pixels where that can be avoided: its images are views of memory maps
+(`jaxsr.data.cache`) in the types of the files, and cropping and flipping (`jaxsr.data.augment`) give views
+again. `stack`, which makes a batch, reads the pixels that are left, once, and turns them into float32. Only
+the colour of windows with frames that are not rendered is copied, without reading what is hidden.
 """
 
 import bisect
@@ -18,7 +19,8 @@ from jaxsr.data.cache import Arrays, open_arrays
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, Frame, GBuffer, Scale, Window
 from jaxsr.io.sequence import Sequence as Clip
-from jaxsr.layers import FIELDS, LAYERS, channels
+from jaxsr.layers import FIELDS, channels, needed
+from jaxsr.methods.base import Needs, Windows
 from jaxsr.progress import Progress, silent
 
 NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in ("color", *FIELDS))
@@ -26,45 +28,52 @@ NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in ("co
 
 
 class WindowSource:
-    """Item i is a `Window` of `length` consecutive frames; no window crosses a reset.
+    """Item i is a `Window` of consecutive frames; no window crosses a reset.
 
-    Buffers that are not needed are None; depth, motion and LR colour, which a `Frame` always has, are then
-    zeros that take no memory. All frames are `rendered`. The first frame of a window is a `cut` only if the
-    sequence has one there: otherwise it has a past that the window leaves out. At scale 1 the HR images are
-    the LR ones, and the jitter is 0. Cameras and jitter are float64 until the batch is made.
+    Every window has what its cadence allows. The colour of frames that do not count as rendered is zero, and
+    is not read from the files. The truth is that of the frames to be made, `windows.targets`, and so is the
+    LR truth. Buffers that no frame of a window needs are None. LR colour, which a `Frame` always has, is then
+    a view of a single zero.
+
+    The first frame of a window is a `reset` only if the sequence has one there: otherwise it has a past that
+    the window leaves out. At scale 1 the HR images are the LR ones, and the jitter is 0. The camera is None
+    unless all sequences know it. Cameras, exposure and jitter are float64 until the batch is made.
 
     Args:
         sequences: folders of sequences.
-        scale: HR size divided by LR size, one that all of them have.
-        needs: buffers, from `NEEDS`.
-        length: frames in a window.
+        needs: of the method.
+        windows: length and cadence of the windows, and which frames are to be made.
+        scale: HR size divided by LR size, one that all sequences have.
         held_back: frames at the end of each sequence that are in no window.
         cache, progress: as in `open_arrays`.
 
     Raises:
-        JaxsrError: no sequences; one that lacks the scale or a layer, or has no `length` frames without a
-            cut; unknown needs; what `open_arrays` raises.
+        JaxsrError: no sequences; one that lacks the scale or a layer, or has too few frames without a cut;
+            unknown needs; windows that contradict themselves; what `open_arrays` raises.
     """
 
     def __init__(
         self,
         sequences: Iterable[str | Path],
+        needs: Needs,
+        windows: Windows,
         *,
         scale: int,
-        needs: frozenset[str],
-        length: int = 1,
         held_back: int = 0,
         cache: Path | None = None,
         progress: Progress = silent,
     ):
-        unknown = sorted(needs - NEEDS)
+        check_windows(windows)
+        read = buffers_of(needs, windows)
+        unknown = sorted(read - NEEDS)
         if unknown:
             raise JaxsrError(f"unknown buffer {unknown[0]!r}", expected=f"some of {sorted(NEEDS)}")
-        if length < 1:
-            raise JaxsrError("no frames in a window", expected="1 or more", found=length)
+        if scale < 1:
+            raise JaxsrError("bad scale", expected="1 or more", found=scale)
         if held_back < 0:
             raise JaxsrError("bad number of held-back frames", expected="0 or more", found=held_back)
-        self.scale, self.needs, self.length = scale, needs, length
+        self.scale, self.windows, self.held_back = scale, windows, held_back
+        self._layers = {place: needed(read, place) for place in ("lr", "hr")}
         self.sequences: list[Clip] = []
         self._arrays: list[tuple[Arrays, Arrays]] = []
         self._starts: list[list[int]] = []
@@ -77,14 +86,15 @@ class WindowSource:
             clip = Clip.open(path)
             clip.layers(lr)
             self.sequences.append(clip)
-            self._starts.append(_starts(clip, length, held_back))
+            self._starts.append(_starts(clip, windows.length, held_back))
+        truth = {"hr.color", "lr.color"} if windows.lr_truth else {"hr.color"}
         for path in paths:
             found = open_arrays(path, self.resolutions, cache=cache, progress=progress)
             self._arrays.append((found[lr], found["hr"]))
-            for need in sorted(needs | {"hr.color"}):
+            for need in sorted(read | truth):
                 place, layer = need.split(".")
                 _check_layer(found[lr if place == "lr" else "hr"], layer, need)
-        self._cameras = all(info.has_camera for clip in self.sequences for info in clip.infos)
+        self._has_cameras = all(info.has_camera for clip in self.sequences for info in clip.infos)
         self._ends = list(itertools.accumulate(len(s) for s in self._starts))
 
     def __len__(self) -> int:
@@ -100,47 +110,85 @@ class WindowSource:
     def __getitem__(self, i: int) -> Window:
         k, start = self.place(i)
         clip = self.sequences[k]
-        frames = slice(start, start + self.length)
         lr, hr = self._arrays[k]
+        frames = slice(start, start + self.windows.length)
         infos = clip.infos[frames]
-        jitter: Any = np.array([info.jitter_px for info in infos], float) * (self.scale > 1)
-        flags: Any = (np.array([info.reset for info in infos]), np.ones(len(infos), bool))
-        exposure: Any = np.array([clip.exposure_at(start + t) for t in range(self.length)])
+        made = [start + t for t in self.windows.targets]
+        values: dict[str, Any] = {
+            "jitter_px": np.array([info.jitter_px for info in infos], float) * (self.scale > 1),
+            "reset": np.array([info.reset for info in infos]),
+            "rendered": np.array(self.windows.cadence),
+            "exposure": np.array([clip.exposure_at(start + t) for t in range(len(infos))], float),
+        }
         camera: Any = None
-        if self._cameras:
-            camera = Camera(
-                *(np.array([getattr(info, n) for info in infos], float) for n in Camera._fields)  # type: ignore
-            )
-        low, high = self._images(lr, "lr", frames), self._images(hr, "hr", frames)
-        color = low.pop("color")
-        high.pop("color")
+        if self._has_cameras:
+            camera = Camera(*(np.array([getattr(info, n) for info in infos], float) for n in Camera._fields))  # type: ignore[arg-type]
         return Window(
             Frame(
-                color_linear=color,
-                lr=GBuffer(**low),
-                hr=GBuffer(**high),
-                jitter_px=jitter,
+                color_linear=self._color(lr, frames),  # type: ignore[arg-type]
+                lr=self._gbuffer(lr, "lr", frames),
+                hr=self._gbuffer(hr, "hr", frames),
                 camera=camera,
-                reset=flags[0],
-                rendered=flags[1],
-                exposure=exposure,
                 factor=Scale(self.scale),
+                **values,
             ),
-            hr.layers["color"][frames],  # type: ignore[arg-type]
+            _pick(hr.layers["color"], made),
+            _pick(lr.layers["color"], made) if self.windows.lr_truth else None,
         )
 
-    def _images(self, arrays: Arrays, place: str, frames: slice) -> dict[str, Any]:
-        """Field of the frame -> `[T, H, W, C]` views: those that are needed, and those that it must have."""
-        w, h = arrays.sequence.size
-        scale = self.scale if place == "lr" else 1
-        zeros = np.broadcast_to(np.float32(0), (self.length, h // scale, w // scale, 1))
-        images: dict[str, Any] = {}
-        for layer, field in ({"color": "color"} | FIELDS).items():
-            if f"{place}.{layer}" in self.needs:
-                images[field] = arrays.layers[layer][frames]
-            elif layer in ("color", "depth", "motion"):
-                images[field] = np.broadcast_to(zeros, (*zeros.shape[:3], len(LAYERS[layer].letters)))
-        return images
+    def _color(self, lr: Arrays, frames: slice) -> np.ndarray:
+        """`[T, h, w, 3]`: LR colour, zero where the frame does not count as rendered."""
+        cadence = self.windows.cadence
+        if "color" not in self._layers["lr"] or not any(cadence):
+            width, height = lr.sequence.size
+            size = (height // self.scale, width // self.scale)
+            return np.broadcast_to(np.float32(0), (len(cadence), *size, 3))
+        color = lr.layers["color"][frames]
+        if all(cadence):
+            return color
+        shown = np.zeros(color.shape, color.dtype)
+        for t, rendered in enumerate(cadence):
+            if rendered:
+                shown[t] = color[t]
+        return shown
+
+    def _gbuffer(self, arrays: Arrays, place: str, frames: slice) -> GBuffer:
+        """Views `[T, H, W, C]` of the buffers that are needed."""
+        layers = self._layers[place]
+        return GBuffer(**{f: arrays.layers[n][frames] for n, f in FIELDS.items() if n in layers})  # type: ignore[arg-type]
+
+
+def buffers_of(needs: Needs, windows: Windows) -> frozenset[str]:
+    """What the frames of these windows need, all together."""
+    extrapolating = not all(windows.cadence)
+    return frozenset().union(*(needs.of(rendered, extrapolating) for rendered in windows.cadence))
+
+
+def check_windows(windows: Windows) -> None:
+    """See that length, cadence, the frames to be made and the warm-up fit each other.
+
+    Raises:
+        JaxsrError: they do not; it says what is wrong.
+    """
+    length = windows.length
+    if length < 1:
+        raise JaxsrError("no frames in a window", expected="1 or more", found=length)
+    if len(windows.cadence) != length:
+        raise JaxsrError(
+            "the cadence of a window has another length",
+            expected=f"{length} flags",
+            found=len(windows.cadence),
+        )
+    if not windows.cadence[0]:
+        raise JaxsrError("the first frame of a window must be rendered", found=list(windows.cadence))
+    outside = [i for i in windows.made or () if not -length <= i < length]
+    if outside or not windows.targets or len({*windows.targets}) < len(windows.targets):
+        expected = f"positions from {-length} to {length - 1}, at least one, each once"
+        raise JaxsrError("bad frames to be made", expected=expected, found=list(windows.made or ()))
+    if not 0 <= windows.warmup < length:
+        raise JaxsrError("bad warm-up", expected=f"0 to {length - 1} frames", found=windows.warmup)
+    if windows.multiple < 1:
+        raise JaxsrError("bad multiple of crops", expected="1 or more", found=windows.multiple)
 
 
 def stack(windows: Sequence[Window]) -> Window:
@@ -153,6 +201,14 @@ def stack(windows: Sequence[Window]) -> Window:
         return out
 
     return jax.tree.map(leaf, *windows)
+
+
+def _pick(array: np.ndarray, positions: list[int]) -> Any:
+    """The frames at these rising positions: a view if they are evenly spaced, else a copy."""
+    steps = {b - a for a, b in itertools.pairwise(positions)} or {1}
+    if len(steps) > 1:
+        return array[positions]
+    return array[positions[0] : positions[-1] + 1 : steps.pop()]
 
 
 def _starts(clip: Clip, length: int, held_back: int) -> list[int]:

@@ -1,6 +1,6 @@
 """What a training is: one frozen dataclass, checked, and kept as `config.json` beside the result.
 
-Options of the network and its loss are not here: they are those of the method (`jaxsr.methods.LEARNED`).
+Options of networks and of their losses belong to the methods (`jaxsr.methods.LEARNED`).
 """
 
 import dataclasses
@@ -10,13 +10,19 @@ import math
 from collections.abc import Sequence as List
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
+from jaxsr.data.loader import check_crop
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path
+from jaxsr.files import read_json, write_text
 from jaxsr.io.sequence import Sequence
 from jaxsr.methods import Method
 from jaxsr.provenance import changes, provenance
+from jaxsr.training.initial import hashes, same_hashes
+
+Schedule = Literal["exponential", "cosine", "constant"]
+Score = Literal["psnr", "psnr_rendered", "psnr_extrapolated", "ssim", "ssim_rendered", "ssim_extrapolated"]
+"""A number of an evaluation."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +34,7 @@ class TrainConfig:
     eval_data: tuple[Path, ...] = ()
     """Sequences to evaluate on; by default the last frame of each training sequence, held back."""
     out: Path = Path("jaxsr-train")
-    """Folder for checkpoints, weights, pictures and logs. A folder that holds a training goes on with it."""
+    """Folder for checkpoints, weights, pictures and logs. A training that it holds is resumed."""
     cache: Path | None = None
     """Folder for converted sequences; ~/.cache/jaxsr by default."""
     scale: int = 4
@@ -41,12 +47,17 @@ class TrainConfig:
     """Side of the square crops, in HR pixels."""
     learning_rate: float = 1e-3
     """Of Adam, at the start."""
-    schedule: Literal["exponential", "cosine", "constant"] = "exponential"
-    """exponential: the paper's factor 0.98 an epoch for 100 epochs, stretched over all steps."""
+    schedule: Schedule = "exponential"
+    """exponential: the paper's factor 0.98 per epoch for 100 epochs, stretched over all steps after the hold.
+    cosine: down to `end_rate` at the last step."""
+    hold_steps: int = 0
+    """Steps at the start with the full learning rate, before it falls."""
+    end_rate: float = 0.0
+    """Learning rate at the end of the cosine."""
     clip_norm: float = 0.0
     """Largest norm of the gradient of all weights together; 0 does not clip."""
     ema: float = 0.0
-    """Decay of the averaged weights that are evaluated and released, such as 0.999; 0 keeps none."""
+    """Decay of averaged weights, such as 0.999, which are then evaluated and released; 0 keeps none."""
     flips: bool = True
     """Mirror every second crop left to right."""
     seed: int = 0
@@ -55,31 +66,47 @@ class TrainConfig:
     """Steps between evaluations, with pictures and weights; the last step always has one."""
     save_every: int = 50
     """Steps between checkpoints; the last step always has one."""
-    init: Path | None = None
-    """Weights to start from (.safetensors)."""
+    best_by: Score = "psnr"
+    """Number of the evaluations that decides which weights are the best. "psnr" and "ssim" are means over all
+    frames that are measured, the others over those of one kind where windows have both."""
+    init: tuple[str, ...] = ()
+    """Weights to start from: FILE for the whole network, PART=FILE for a part of it. Later ones replace
+    earlier ones."""
 
-    def check(self) -> None:
-        """Raise JaxsrError, which names the option, if a value is out of range."""
-        for name, low in (("scale", 1), ("steps", 1), ("batch", 1), ("crop", 1), ("seed", 0)):
-            _check(name, getattr(self, name) >= low, f"a whole number from {low}", getattr(self, name))
-        for name in ("eval_every", "save_every"):
+    def __post_init__(self) -> None:
+        if isinstance(self.init, str | Path):  # one file
+            object.__setattr__(self, "init", (str(self.init),))
+
+    def check(self, multiple: int = 1) -> None:
+        """Raise JaxsrError, which names the option, if a value is out of range.
+
+        Args:
+            multiple: what the LR sides of crops must be multiples of.
+        """
+        for name in ("scale", "steps", "batch", "crop", "eval_every", "save_every"):
             _check(name, getattr(self, name) >= 1, "a whole number from 1", getattr(self, name))
-        rate, clip, ema = self.learning_rate, self.clip_norm, self.ema
+        _check("seed", 0 <= self.seed < 2**32, "a whole number from 0 to 2**32 - 1", self.seed)
+        rate, end, clip, ema = self.learning_rate, self.end_rate, self.clip_norm, self.ema
         _check("learning_rate", math.isfinite(rate) and rate > 0, "a number above 0", rate)
         _check("clip_norm", math.isfinite(clip) and clip >= 0, "0, or a number above it", clip)
         _check("ema", 0 <= ema < 1, "a number from 0, below 1", ema)
-        _check("schedule", self.schedule in SCHEDULES, " | ".join(SCHEDULES), self.schedule)
-        _check("crop", self.crop % self.scale == 0, f"a multiple of the scale {self.scale}", self.crop)
+        for name, kind in (("schedule", Schedule), ("best_by", Score)):
+            choices = get_args(kind)
+            _check(name, getattr(self, name) in choices, " | ".join(choices), getattr(self, name))
+        hold = self.hold_steps
+        _check("hold_steps", 0 <= hold < self.steps, f"0, or fewer than the {self.steps} steps", hold)
+        if self.schedule == "cosine":
+            _check("end_rate", 0 <= end <= rate, f"a number from 0 to the learning rate {rate}", end)
+        else:
+            _check("end_rate", end == 0, "0, unless --schedule cosine", end)
+        check_crop(self.crop, self.scale, multiple, "--crop")
 
 
-SCHEDULES = ("exponential", "cosine", "constant")
 MAY_CHANGE = frozenset({"out", "cache", "data", "eval_data", "eval_every", "save_every", "init"})
-"""What a training can be resumed with another value of: nothing that the weights depend on.
+"""Options that may have another value when a training is resumed: the weights do not depend on them.
 
-Of the data, the sequences count (`identity`), and of the weights that it began with their numbers, wherever
-these files lie. `steps` is not among them, for the schedule ends there."""
-MISSING = "missing"
-"""In place of the hash of `init`, where the file is no longer there."""
+Of the data, the sequences count (`identity`), and of the weights to start from, the content of the files:
+where they lie does not matter. `steps` is not among these options, since the schedule depends on it."""
 
 
 def _check(name: str, good: bool, expected: str, found: object) -> None:
@@ -96,31 +123,29 @@ def describe(
         "method": method.name,
         "settings": dict(method.network.settings),
         "loss": dict(method.network.loss_settings),
-        "config": json.loads(json.dumps(dataclasses.asdict(config), default=str)),
+        "config": _json(config),
         "sequences": [identity(path) for path in trained_on],
         "evaluated": [identity(path) for path in evaluated_on],
-        "init": _hash_of(config.init),
+        "init": hashes(config.init),
         "made": provenance(),
     }
 
 
+def _json(config: TrainConfig) -> dict[str, Any]:
+    return json.loads(json.dumps(dataclasses.asdict(config), default=str))
+
+
 def identity(path: Path) -> str:
-    """Name of a sequence, and a hash of its description: it may move, but not change."""
+    """Name of a sequence and a hash of its description, which stay the same when the folder moves."""
     digest = hashlib.sha256((path / "sequence.json").read_bytes()).hexdigest()
     return f"{Sequence.open(path).name} {digest[:12]}"
-
-
-def _hash_of(file: Path | None) -> str | None:
-    if file is None:
-        return None
-    return hashlib.sha256(file.read_bytes()).hexdigest()[:12] if file.is_file() else MISSING
 
 
 def enter(out: Path, new: dict[str, Any]) -> list[str]:
     """Begin or resume the training of this description in the folder `out`.
 
     Returns:
-        What is different from when it began, and does not forbid to go on: other versions, another device.
+        Differences that do not forbid to resume, as lines for the user: other versions, another device.
 
     Raises:
         JaxsrError: the folder holds another training (the differences are named), or other files.
@@ -137,7 +162,7 @@ def enter(out: Path, new: dict[str, Any]) -> list[str]:
             )
     if file.is_file():
         try:
-            old = json.loads(file.read_text(encoding="utf-8"))
+            old = read_json(file, dict)
             found = differences(old, new)
             made = old["made"]
         except (ValueError, KeyError, TypeError, AttributeError) as e:
@@ -149,25 +174,28 @@ def enter(out: Path, new: dict[str, Any]) -> list[str]:
                 "the folder holds a training with another configuration",
                 where=out,
                 found=", ".join(found),
-                fix="choose another --out (with --init, to start from these weights), or give the old values",
+                fix="choose another --out (with --init to start from these weights), or give the old values",
             )
         changed = changes(made, new["made"])
-        return [f"not to the bit as if it had never stopped: {', '.join(changed)}"] if changed else []
-    with atomic_path(file) as temporary:
-        temporary.write_text(json.dumps(new, indent=1) + "\n", encoding="utf-8")
+        if not changed:
+            return []
+        return [f"the result may differ from that of a training without a stop: {', '.join(changed)}"]
+    write_text(file, json.dumps(new, indent=1) + "\n")
     return []
 
 
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """ "field: old -> new" for all that may not differ when a training is resumed."""
 
+    defaults = _json(TrainConfig())  # of options that did not exist when an old training began
+
     def flat(record: dict[str, Any]) -> dict[str, Any]:
-        kept = {k: v for k, v in record["config"].items() if k not in MAY_CHANGE}
+        kept = {k: v for k, v in (defaults | record["config"]).items() if k not in MAY_CHANGE}
         data = {k: record[k] for k in ("method", "sequences", "evaluated")} | {"init": record.get("init")}
         return data | kept | record["settings"] | record["loss"]
 
     a, b = flat(old), flat(new)
-    if b["init"] == MISSING and a["init"] is not None:  # it has served
+    if same_hashes(a["init"], b["init"]):  # perhaps the file is gone, which only the first step needed
         b["init"] = a["init"]
     return [
         f"{name}: {_short(a.get(name))} -> {_short(b.get(name))}"

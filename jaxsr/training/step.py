@@ -1,7 +1,7 @@
 """One update of the weights, as one compiled function; batches are spread over the local devices.
 
 Batch statistics and the loss are those of the whole batch: the compiler sees the batch as one array and adds
-what communication that takes.
+the communication that this takes.
 """
 
 from typing import Any
@@ -19,11 +19,11 @@ from jaxsr.frames import Window
 from jaxsr.methods import Method
 from jaxsr.methods.base import Net
 from jaxsr.training.config import TrainConfig
-from jaxsr.training.state import TrainState, optimizer
+from jaxsr.training.state import TrainState, optimizer, split
 
 
 def shardings(batch: int, devices: list[jax.Device] | None = None) -> tuple[NamedSharding, NamedSharding]:
-    """How the state lies on the devices (whole, on each) and how a batch does (in equal parts).
+    """Shardings of the state (a whole copy on each device) and of a batch (in equal parts).
 
     Args:
         devices: all local ones by default.
@@ -49,28 +49,26 @@ def make_step(method: Method, graphdef: nnx.GraphDef, config: TrainConfig, whole
     `measured` holds "loss", its parts as "loss/<name>", and "grad_norm" before clipping.
     """
     assert method.network is not None
-    loss, tx = method.network.loss, optimizer(config)
+    network, tx = method.network, optimizer(config)
 
-    def loss_of(params: Net, rest: Net, window: Window):
-        net = nnx.merge(graphdef, params, rest, copy=True)  # new variables, that this trace may change
-        total, parts = loss(net, window)
-        return total, (parts, nnx.state(net, nnx.Param, ...)[1])
+    def loss_of(params: Net, frozen: Net, rest: Net, window: Window):
+        # A copy: new variables, which the loss may change while it is traced.
+        net = nnx.merge(graphdef, params, frozen, rest, copy=True)
+        total, parts = network.loss(net, window)
+        return total, (parts, split(net, network.frozen)[2])
 
     def step(state: TrainState, window: Window):
         grad = jax.value_and_grad(loss_of, has_aux=True)
-        (total, (parts, rest)), gradient = grad(state.params, state.rest, window)
+        (total, (parts, rest)), gradient = grad(state.params, state.frozen, state.rest, window)
         with jax.numpy_dtype_promotion("standard"):  # optax mixes integers with floats
             updates, opt = tx.update(gradient, state.optimizer, state.params)
-        params = optax.apply_updates(state.params, updates)
+            params = optax.apply_updates(state.params, updates)
         average = state.average
         if average is not None:
             average = averaged(average, nnx.merge_state(params, rest), config.ema, state.step)
-        measured = {
-            "loss": total,
-            "grad_norm": jnp.sqrt(sum(jnp.sum(g * g) for g in jax.tree.leaves(gradient))),
-        }
+        measured = {"loss": total, "grad_norm": optax.global_norm(gradient)}
         measured |= {f"loss/{name}": value for name, value in parts.items()}
-        return TrainState(state.step + 1, params, rest, opt, average), measured
+        return TrainState(state.step + 1, params, state.frozen, rest, opt, average), measured
 
     return jax.jit(step, donate_argnums=0, out_shardings=whole)
 
@@ -78,10 +76,12 @@ def make_step(method: Method, graphdef: nnx.GraphDef, config: TrainConfig, whole
 def averaged(average: Net, new: Net, decay: float, step: Array) -> Net:
     """`d average + (1 - d) new`, d = min(decay, (1 + t) / (10 + t)): the first weights are soon forgotten."""
     t = step.astype(jnp.float32)
-    d = jnp.minimum(np.float32(decay), (1 + t) / (10 + t))
+    small = jnp.minimum(np.float32(decay), (1 + t) / (10 + t))
 
     def leaf(a: Array, b: Array) -> Array:
-        # Counters and random keys have no average.
-        return d * a + (1 - d) * b if jnp.issubdtype(b.dtype, jnp.floating) else b
+        if not jnp.issubdtype(b.dtype, jnp.floating):
+            return b  # counters and random keys have no average
+        d = small.astype(b.dtype)
+        return d * a + (1 - d) * b
 
     return jax.tree.map(leaf, average, new)

@@ -16,8 +16,9 @@ from jaxsr import ops
 from jaxsr.data.augment import crop, flip, random_crop
 from jaxsr.data.windows import NEEDS, WindowSource, stack
 from jaxsr.errors import JaxsrError
-from jaxsr.frames import Camera
+from jaxsr.frames import Camera, GBuffer
 from jaxsr.layers import LAYERS
+from jaxsr.methods import Needs, Windows
 from jaxsr.ops.pinhole import world_from_depth
 from tests.builders import make_sequence
 
@@ -36,7 +37,8 @@ def scene(scale=2):
             frozen=True,
             precision=dict.fromkeys(LAYERS, "float"),
         )
-        source = WindowSource([seq.path], scale=scale, needs=NEEDS, length=2, cache=Path(folder) / "c")
+        windows = Windows(2, made=None, lr_truth=True)
+        source = WindowSource([seq.path], Needs(NEEDS), windows, scale=scale, cache=Path(folder) / "c")
         window = jax.tree.map(np.array, source[1])
     return window
 
@@ -224,13 +226,26 @@ def test_colours_and_flags_are_only_moved():
     np.testing.assert_array_equal(mirrored.frames.reset, window.frames.reset)
 
 
-def test_absent_buffers_stay_absent():
+def test_what_is_none_stays_none():
+    """Buffers, all of them, the camera and the LR truth."""
     window = scene()
-    bare = window.frames.hr._replace(normal=None, base_color=None)
-    window = window._replace(frames=window.frames._replace(hr=bare))
+    bare = window.frames._replace(hr=GBuffer(), lr=window.frames.lr._replace(normal=None), camera=None)
+    window = window._replace(frames=bare, lr_truth_linear=None)
     part = flip(crop(window, 4, 4, (8, 8)), horizontal=True, vertical=True)
-    assert part.frames.hr.normal is None
-    assert part.frames.hr.base_color is None
+    assert part.frames.hr == GBuffer()
+    assert part.frames.lr.normal is None
+    assert part.frames.camera is None
+    assert part.lr_truth_linear is None
+    assert part.frames.lr.motion_px.shape == (2, 4, 4, 2)
+
+
+@given(cropped())
+def test_lr_truth_goes_with_the_lr_colour(case):
+    """Here every frame is rendered and is to be made, so that both are the same images."""
+    scale, (x, y, w, h), (horizontal, vertical) = case
+    part = flip(crop(scene(scale), x, y, (h, w)), horizontal=horizontal, vertical=vertical)
+    assert part.lr_truth_linear.shape == (2, h // scale, w // scale, 3)
+    np.testing.assert_array_equal(part.lr_truth_linear, part.frames.color_linear)
 
 
 def test_random_crops_reach_every_place_and_mirror_half_of_them():

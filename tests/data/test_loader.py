@@ -9,8 +9,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxsr.data.loader import make_loader
+from jaxsr.data.loader import Loader, Stream, check_crop
+from jaxsr.data.windows import WindowSource
 from jaxsr.errors import JaxsrError
+from jaxsr.io.find import find_sequences
+from jaxsr.methods import Needs, Windows
 from tests.builders import make_sequence
 
 NEEDS = frozenset({"lr.color", "hr.depth", "hr.normal"})
@@ -18,14 +21,17 @@ NEEDS = frozenset({"lr.color", "hr.depth", "hr.normal"})
 
 @pytest.fixture(scope="module")
 def load(tmp_path_factory):
-    """`make_loader` on two small sequences: 9 frames, 7 windows of two."""
+    """A loader of two small sequences: 9 frames, 7 windows of two."""
     root = tmp_path_factory.mktemp("loader")
     for name, frames in (("a", 5), ("b", 4)):
         make_sequence(root / "set" / name, size=(24, 16), scales=(2, 4), frames=frames)
 
     def call(paths=(root / "set",), **arguments):
-        defaults = {"scale": 2, "needs": NEEDS, "window": 2, "batch": 3, "crop": 8, "cache": root / "cache"}
-        return make_loader(paths, **(defaults | arguments))
+        windows = arguments.pop("windows", Windows(2, made=None))
+        needs = Needs(arguments.pop("needs", NEEDS))
+        places = {"scale": arguments.pop("scale", 2), "held_back": arguments.pop("held_back", 0)}
+        source = WindowSource(find_sequences(paths), needs, windows, cache=root / "cache", **places)
+        return Loader(source, Stream(**({"batch": 3, "crop": 8} | arguments)))
 
     return call
 
@@ -110,11 +116,11 @@ def test_every_epoch_shows_every_window_once_in_another_order_and_crop(load):
 
 def test_a_small_data_set_fills_a_batch(load, tmp_path):
     seq = make_sequence(tmp_path / "one", size=(24, 16), scales=(2,), frames=1)
-    loader = load([seq.path], window=1, batch=8)
+    loader = load([seq.path], windows=Windows(), batch=8)
     batch = next(loader)
     assert batch.truth_linear.shape == (8, 1, 8, 8, 3)
     assert len(np.unique(batch.frames.camera.lens_shift, axis=0)) > 3
-    equal(batch, next(load([seq.path], window=1, batch=8)))
+    equal(batch, next(load([seq.path], windows=Windows(), batch=8)))
 
 
 def test_processes_share_one_stream(load):
@@ -145,6 +151,9 @@ def test_a_position_of_another_stream_is_refused(load, tmp_path):
     for other in ({"seed": 1}, {"batch": 2}, {"crop": 4}, {"scale": 4}, {"flips": False}, {"held_back": 1}):
         with pytest.raises(JaxsrError, match=r"position .* belongs to other data or other options"):
             load(**other).set_state(state)
+    for windows in (Windows(2), Windows(2, (True, False), made=None), Windows(2, made=None, lr_truth=True)):
+        with pytest.raises(JaxsrError, match="belongs to other data"):
+            load(windows=windows).set_state(state)
     seq = make_sequence(tmp_path / "other", size=(24, 16), scales=(2,))
     with pytest.raises(JaxsrError, match="belongs to other data"):
         load([seq.path]).set_state(state)
@@ -160,6 +169,26 @@ def test_a_copy_of_the_data_goes_on(load, tmp_path):
     equal(next(one), next(other))
 
 
+def test_crops_of_windows_with_a_cadence(load):
+    """Hidden colour stays hidden, and LR truth is cropped and mirrored with the rest."""
+    windows = Windows(3, (True, False, True), made=(1,), lr_truth=True)
+    shown, hidden = (next(load(windows=windows._replace(rendered=r))) for r in (None, windows.rendered))
+    assert hidden.truth_linear.shape == (3, 1, 8, 8, 3)
+    assert not hidden.frames.color_linear[:, 1].any()
+    np.testing.assert_array_equal(hidden.frames.color_linear[:, ::2], shown.frames.color_linear[:, ::2])
+    np.testing.assert_array_equal(hidden.lr_truth_linear[:, 0], shown.frames.color_linear[:, 1])
+
+
+def test_crops_are_multiples_of_what_the_network_takes(load):
+    windows = Windows(2, multiple=3)
+    batch = next(load(windows=windows, crop=12))
+    assert batch.frames.color_linear.shape[2:4] == (6, 6)
+    with pytest.raises(JaxsrError, match=r"multiple of 6: .* multiples of 3, at scale 2; .*choose 6 or 12"):
+        load(windows=windows, crop=8)
+    with pytest.raises(JaxsrError, match=r"--crop: bad crop; .*; choose 32"):
+        check_crop(30, 4, 8, "--crop")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -171,8 +200,8 @@ def test_a_copy_of_the_data_goes_on(load, tmp_path):
         ({"seed": 2**32}, "bad seed"),
         ({"scale": 0}, "bad scale"),
         ({"scale": 8}, r"set/a: scale 8 is not available; expected one of \[1, 2, 4\]"),
-        ({"window": 5}, r"set/b: fewer frames than a window has"),
-        ({"window": 0}, "no frames in a window"),
+        ({"windows": Windows(5)}, r"set/b: fewer frames than a window has"),
+        ({"windows": Windows(0)}, "no frames in a window"),
         ({"needs": frozenset({"hr.colour"})}, r"unknown buffer 'hr\.colour'"),
         ({"process_index": 2, "process_count": 2}, "bad process; expected 0 to 1; found 2"),
         ({"paths": []}, "no sequences"),
