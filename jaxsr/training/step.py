@@ -66,7 +66,7 @@ def make_step(method: Method, graphdef: nnx.GraphDef, config: TrainConfig, whole
         average = state.average
         if average is not None:
             average = averaged(average, nnx.merge_state(params, rest), config.ema, state.step)
-        measured = {"loss": total, "grad_norm": optax.global_norm(gradient)}
+        measured = {"loss": total, "grad_norm": optax.tree.norm(gradient)}
         measured |= {f"loss/{name}": value for name, value in parts.items()}
         return TrainState(state.step + 1, params, state.frozen, rest, opt, average), measured
 

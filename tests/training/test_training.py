@@ -17,15 +17,19 @@ import optax
 import pytest
 from flax import nnx
 
-from jaxsr.data.loader import make_loader
+from jaxsr.data.loader import Loader, Stream
+from jaxsr.data.windows import WindowSource
 from jaxsr.errors import JaxsrError
 from jaxsr.io.images import read_png
-from jaxsr.methods import fusion_sr, variant
+from jaxsr.methods import Network, fusion_sr, variant
 from jaxsr.methods.image_loss import ImageLoss
 from jaxsr.progress import Bar
-from jaxsr.training import TrainConfig, command, loop
+from jaxsr.training import TrainConfig
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
+from jaxsr.training.data import open_data
+from jaxsr.training.evaluate import Evaluator, evaluation_windows
+from jaxsr.training.process import only_one
 from jaxsr.training.record import Log, plot_curve
 from jaxsr.training.state import begin, optimizer, schedule
 from jaxsr.training.step import averaged, make_step, shardings
@@ -175,13 +179,9 @@ def test_two_devices_train_as_one(data, method):
     size, so that rounding decides where weights go whose gradient is nearly 0.
     """
     config = TrainConfig(batch=4, scale=2, crop=16, ema=0.9, clip_norm=1.0)
-    shared = {
-        "scale": 2,
-        "needs": method.needs.of(True),
-        "window": method.network.windows.length,
-        "cache": data.parent / "cache",
-    }
-    loader = make_loader([data], batch=4, crop=16, **shared)
+    windows = method.network.windows
+    source = WindowSource([data / "clip"], method.needs, windows, scale=2, cache=data.parent / "cache")
+    loader = Loader(source, Stream(batch=4, crop=16))
     batches = [next(loader) for _ in range(3)]
     loader.close()
     graphdef, start = begin(method, config)
@@ -211,16 +211,31 @@ def test_batch_must_be_shared_out():
         shardings(3)
 
 
-def test_schedules():
-    def rate(name, t):
-        return float(schedule(TrainConfig(schedule=name, steps=200))(t))
+def rate(t, **options):
+    return float(schedule(TrainConfig(steps=200, **options))(t))
 
-    assert rate("exponential", 0) == pytest.approx(1e-3)
-    assert rate("exponential", 2) == pytest.approx(1e-3 * 0.98, rel=1e-5)  # an epoch is a hundredth
-    assert rate("exponential", 200) == pytest.approx(1e-3 * 0.98**100, rel=1e-4)
-    assert rate("cosine", 100) == pytest.approx(5e-4, rel=1e-4)
-    assert rate("cosine", 200) == pytest.approx(0, abs=1e-9)
-    assert rate("constant", 150) == pytest.approx(1e-3)
+
+def test_schedules():
+    assert rate(0) == pytest.approx(1e-3)
+    assert rate(2) == pytest.approx(1e-3 * 0.98, rel=1e-5)  # an epoch is a hundredth
+    assert rate(200) == pytest.approx(1e-3 * 0.98**100, rel=1e-4)
+    assert rate(100, schedule="cosine") == pytest.approx(5e-4, rel=1e-4)
+    assert rate(200, schedule="cosine") == pytest.approx(0, abs=1e-9)
+    assert rate(150, schedule="constant") == pytest.approx(1e-3)
+
+
+def test_schedules_that_hold():
+    """Constant for the first steps; then as without a hold, over the steps that are left."""
+    cosine = {"schedule": "cosine", "hold_steps": 50, "end_rate": 1e-6}
+    found = [rate(t, **cosine) for t in (0, 49, 50, 51, 125, 199, 200)]
+    assert found[:3] == [pytest.approx(1e-3)] * 3
+    assert found[3] < found[2]
+    assert found[4] == pytest.approx((1e-3 + 1e-6) / 2, rel=1e-4)
+    assert found[5] == pytest.approx(1e-6, rel=0.15)
+    assert found[6] == pytest.approx(1e-6, rel=1e-3)
+    assert rate(49, hold_steps=50) == rate(50, hold_steps=50) == pytest.approx(1e-3)
+    assert rate(200, hold_steps=50) == pytest.approx(1e-3 * 0.98**100, rel=1e-4)
+    assert rate(199, hold_steps=199) == pytest.approx(1e-3)
 
 
 def test_clipping():
@@ -265,23 +280,26 @@ def test_fine_tuning_at_another_scale(whole, data, tmp_path):
     tiny_method.train(data, tmp_path / "out", **options)
     arrays, header = load_weights(tmp_path / "out" / "weights.safetensors")
     assert header["scale"] == 4
-    assert header["training"]["config"]["init"] == "weights.safetensors"
+    assert header["training"]["config"]["init"] == ["weights.safetensors"]
+    assert header["training"]["best_by"] == "psnr"
     np.testing.assert_allclose(
         arrays["conv1.kernel"], load_weights(whole / "weights.safetensors")[0]["conv1.kernel"], atol=1e-7
     )
 
 
-def test_weights_of_other_options_are_noted(data, tmp_path, capsys):
+def test_weights_of_other_settings_are_noted(data, tmp_path, capsys):
     """Shapes can fit where the meaning does not."""
-    tiny = tiny_method.method()
-    settings = {"demodulated": False, "buffers": ["depth"], "gone": 1}
-    old = tiny._replace(network=tiny.network._replace(settings=settings))
-    settings = {"demodulated": True, "buffers": ["depth"]}
-    new = tiny._replace(network=tiny.network._replace(settings=settings))
+    old, new = (
+        tiny_method.method()._replace(network=Network(tiny_method.Net, tiny_method.loss, settings=settings))
+        for settings in (
+            {"demodulated": False, "buffers": ["depth"]},
+            {"demodulated": True, "buffers": ["depth"]},
+        )
+    )
     config = TrainConfig(data=(data,), out=tmp_path / "old", cache=data.parent / "cache", scale=2, crop=16)
     config = dataclasses.replace(config, steps=1, batch=2)
     file = train_method(old, config, quiet=True)
-    train_method(new, dataclasses.replace(config, out=tmp_path / "new", init=file))
+    train_method(new, dataclasses.replace(config, out=tmp_path / "new", init=(str(file),)))
     assert "weights.safetensors was made with other options: demodulated False -> True\n" in (
         capsys.readouterr().err
     )
@@ -300,45 +318,37 @@ def test_the_sample_is_the_default(tmp_path):
     assert next(sample.glob("*/hr/*.exr")).stat().st_mtime_ns == first
 
 
-def test_the_last_frame_is_held_back(data, whole):
-    shared = {
-        "scale": 2,
-        "held_back": 1,
-        "cache": data.parent / "cache",
-        "needs": tiny_method.method().needs.of(True),
-    }
-    loader = make_loader([data], crop=16, **shared)
+def test_the_last_frame_is_held_back(data):
+    config = TrainConfig(data=(data,), cache=data.parent / "cache", scale=2, crop=16)
+    loader, evaluate = open_data(tiny_method.method(), config, quiet=True)
     loader.close()
     assert loader.windows == 4
-    assert loop.Evaluator(tiny_method.method(), [data / "clip"], **shared).frames == (
-        "clip 5, held back from training"
-    )
-    several = shared | {"held_back": 0, "window": 2}
-    frames = loop.Evaluator(tiny_method.method(window=2), [data / "clip"], **several).frames
-    assert frames == "clip 2, clip 3, clip 4, clip 5"  # the last frames of four windows
+    assert evaluate.frames == "clip 5, held back from training"
+
+
+def evaluator(method, data, **options):
+    windows = evaluation_windows(method.network.windows)
+    source = WindowSource([data / "clip"], method.needs, windows, scale=2, cache=data.parent / "cache")
+    return Evaluator(method, source, **options)
+
+
+def test_any_window_is_measured_where_the_sequences_are_others(data):
+    method = tiny_method.method(window=2)
+    assert evaluator(method, data).frames == "clip 2, clip 3, clip 4, clip 5"  # the last of each of 4 windows
 
 
 def test_a_window_is_history(data):
-    """A method with a state sees the frames before the one that is measured, the first of them as a cut."""
+    """A method with a state sees the frames before the one that is measured, the first of them as a reset."""
     seen = []
 
-    def counted(net, state, frame):
-        jax.debug.callback(lambda cut, n: seen.append((bool(cut), int(n))), frame.reset, state)
+    def upscale(net, state, frame):
+        jax.debug.callback(lambda reset, n: seen.append((bool(reset), int(n))), frame.reset, state)
         return state + 1, jnp.ones_like(frame.hr.base_color)
 
     method = tiny_method.method(window=3)._replace(
-        init=lambda frame: jnp.where(frame.reset, jnp.int32(0), jnp.int32(-1)),
-        upscale=counted,
-        extrapolate=counted,
+        init=lambda frame: jnp.where(frame.reset, jnp.int32(0), jnp.int32(-1)), upscale=upscale
     )
-    shared = {
-        "scale": 2,
-        "held_back": 1,
-        "cache": data.parent / "cache",
-        "needs": method.needs.of(True),
-        "window": 3,
-    }
-    found = loop.Evaluator(method, [data / "clip"], **shared)(None)
+    found = evaluator(method, data, last_only=True)(None)
     jax.effects_barrier()
     assert seen == [(True, 0), (False, 1), (False, 2)]
     assert found.picture.shape == (40, 3 * 64, 3)
@@ -486,12 +496,12 @@ class TestErrors:
         assert not list(tmp_path.iterdir())
 
     def test_two_at_once(self, whole, data, tmp_path):
-        with loop._only_one(whole), pytest.raises(JaxsrError, match="another process trains"):
+        with only_one(whole), pytest.raises(JaxsrError, match="another process trains"):
             tiny_method.train(data, whole)
 
     def test_weights_of_another_method(self, whole, data, tmp_path):
         other = tiny_method.method()._replace(name="other")
-        config = TrainConfig(data=(data,), out=tmp_path / "out", init=whole / "weights.safetensors")
+        config = TrainConfig(data=(data,), out=tmp_path / "out", init=(str(whole / "weights.safetensors"),))
         with pytest.raises(JaxsrError, match="weights of another method; expected other; found tiny"):
             train_method(other, config, quiet=True)
 
@@ -525,6 +535,19 @@ class TestErrors:
             (["fusion-sr", "--ema", "1"], "--ema: bad ema"),
             (["fusion-sr", "--clip-norm", "-1"], "--clip-norm"),
             (["fusion-sr", "--eval-every", "0"], "--eval-every"),
+            (["fusion-sr", "--hold-steps", "500"], "--hold-steps: bad hold_steps; expected 0, or fewer than"),
+            (
+                ["fusion-sr", "--end-rate", "1e-6"],
+                "--end-rate: bad end_rate; expected 0, unless --schedule cos",
+            ),
+            (
+                ["fusion-sr", "--schedule", "cosine", "--end-rate", "1"],
+                "--end-rate: bad end_rate; expected a number from 0 to the learning rate 0.001",
+            ),
+            (
+                ["fusion-sr", "--best-by", "psnr_extrapolated"],
+                "--best-by: the evaluation of 'fusion-sr' has no",
+            ),
             (["fusion-sr", "--batch", "3"], "--batch: the batch cannot be shared out"),
             (["fusion-sr", "--init", "nothing.safetensors"], "nothing.safetensors"),
         ],
@@ -581,10 +604,10 @@ def test_checkpoint_holds_random_keys(tmp_path):
     _, state = begin(tiny_method.method(), TrainConfig(ema=0.5))
     with Checkpoints(tmp_path / "checkpoints") as checkpoints:
         assert checkpoints.latest is None
-        checkpoints.save(state, {"data": {"position": 7}, "best_psnr": None})
+        checkpoints.save(state, {"data": {"position": 7}, "best": None})
         _, other = begin(tiny_method.method(), TrainConfig(ema=0.5, seed=1))
         restored, run_ = checkpoints.restore(other)
-    assert run_ == {"data": {"position": 7}, "best_psnr": None}
+    assert run_ == {"data": {"position": 7}, "best": None}
     for a, b in zip(jax.tree.leaves(restored), jax.tree.leaves(state), strict=True):
         assert a.dtype == b.dtype
         pair = [
@@ -617,6 +640,6 @@ def test_command_line(capsys, data, tmp_path):
     assert "compiled in" in err
     status, _, err = run(capsys, "train", "fusion-sr", *options)
     assert status == 0
-    assert "going on after step 2 of 2" in err
+    assert "resuming after step 2 of 2" in err
     line = error_line(capsys, "train", "fusion-sr", *options, "--fusion", "concat")
     assert "fusion: add -> concat" in line
