@@ -99,7 +99,7 @@ def main(
         runs: folder for the runs.
     """
     for name, run in chosen(names).items():
-        start = None if run.start is None else runs / run.start / "weights.safetensors"
+        start = () if run.start is None else (str(runs / run.start / "weights.safetensors"),)
         config = replace(run.config, data=folders_of(run.scenes, data), out=runs / name, init=start)
         print(f"{name}: {train(fusion_sr.method(OPTIONS, LOSS), config)}")
 

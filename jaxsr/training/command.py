@@ -1,4 +1,4 @@
-"""`jaxsr train METHOD`: the options of a training and those of a method, as one command line."""
+"""`jaxsr train METHOD`: the options of a training, of a method and of its loss, as one command line."""
 
 import dataclasses
 import sys
@@ -12,9 +12,10 @@ from jaxsr.methods import LEARNED, Learned
 from jaxsr.training.config import TrainConfig
 from jaxsr.training.loop import train
 
-DESCRIPTION = """Train the network of a method; run again, go on with it.
+DESCRIPTION = """Train the network of a method. The same command resumes a training that was stopped.
 
-Every option is one of a dataclass: of the training (jaxsr.training.TrainConfig), or of the method."""
+The options are the fields of three dataclasses: of the training (jaxsr.training.TrainConfig), of the network
+and of its loss."""
 
 
 def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> None:
@@ -50,7 +51,7 @@ def run(arguments: Sequence[str], learned: dict[str, Learned] | None = None) -> 
     ]
     chosen: Any = tyro.cli(
         dataclasses.make_dataclass("TrainingAndMethod", groups),
-        args=_renamed(rest, {field.name for field in dataclasses.fields(options)}),
+        args=_joined("--init", _renamed(rest, {field.name for field in dataclasses.fields(options)})),
         prog=f"jaxsr train {name}",
         description=DESCRIPTION,
         config=(tyro.conf.OmitArgPrefixes,),
@@ -81,6 +82,25 @@ _OLD_NAMES = {
     "--start": "--base",
     "--color": "",
 }
+
+
+def _joined(option: str, arguments: Sequence[str]) -> list[str]:
+    """The arguments with all values of an option, which may be given several times, in one place."""
+    others: list[str] = []
+    values: list[str] = []
+    place, inside = None, False
+    for argument in arguments:
+        name, equals, value = argument.partition("=")
+        if name == option:
+            place = len(others) if place is None else place
+            values += [value] if equals else []
+            inside = not equals
+        elif inside and not argument.startswith("-"):
+            values.append(argument)
+        else:
+            others.append(argument)
+            inside = False
+    return others if place is None else [*others[:place], option, *values, *others[place:]]
 
 
 def _renamed(arguments: Sequence[str], own: Collection[str] = ()) -> list[str]:

@@ -73,10 +73,6 @@ class TrainConfig:
     """Weights to start from: FILE for the whole network, PART=FILE for a part of it. Later ones replace
     earlier ones."""
 
-    def __post_init__(self) -> None:
-        if isinstance(self.init, str | Path):  # one file
-            object.__setattr__(self, "init", (str(self.init),))
-
     def check(self, multiple: int = 1) -> None:
         """Raise JaxsrError, which names the option, if a value is out of range.
 
@@ -86,6 +82,7 @@ class TrainConfig:
         for name in ("scale", "steps", "batch", "crop", "eval_every", "save_every"):
             _check(name, getattr(self, name) >= 1, "a whole number from 1", getattr(self, name))
         _check("seed", 0 <= self.seed < 2**32, "a whole number from 0 to 2**32 - 1", self.seed)
+        _check("init", isinstance(self.init, tuple | list), "a list of FILE or PART=FILE", self.init)
         rate, end, clip, ema = self.learning_rate, self.end_rate, self.clip_norm, self.ema
         _check("learning_rate", math.isfinite(rate) and rate > 0, "a number above 0", rate)
         _check("clip_norm", math.isfinite(clip) and clip >= 0, "0, or a number above it", clip)

@@ -367,13 +367,8 @@ def test_gradients_are_finite_in_the_dark_and_in_the_sun(name, factor):
 def test_windows_leave_out_the_past(tmp_path):
     """Only where the sequence has a cut does the window have one; none crosses one."""
     make_sequence(tmp_path / "clip", frames=5)
-    source = WindowSource(
-        [tmp_path / "clip"],
-        scale=2,
-        needs=method_of("rrn").needs.of(True),
-        length=3,
-        cache=tmp_path / "cache",
-    )
+    needs, windows = method_of("rrn").needs, Windows(3, made=None)
+    source = WindowSource([tmp_path / "clip"], needs, windows, scale=2, cache=tmp_path / "cache")
     cuts = np.stack([stack([source[i]]).frames.reset[0] for i in range(len(source))])
     np.testing.assert_array_equal(cuts, [[True, False, False], [False] * 3, [False] * 3])
 

@@ -268,7 +268,7 @@ def test_averages_are_what_is_released(whole):
 
 
 def test_fine_tuning_starts_from_the_weights(whole, data, tmp_path):
-    options = {"steps": 1, "init": whole / "weights.safetensors", "ema": 0.0, "learning_rate": 1e-9}
+    options = {"steps": 1, "init": (str(whole / "weights.safetensors"),), "ema": 0.0, "learning_rate": 1e-9}
     tiny_method.train(data, tmp_path / "out", **options)
     old, new = (load_weights(out / "weights.safetensors")[0] for out in (whole, tmp_path / "out"))
     np.testing.assert_allclose(new["conv1.kernel"], old["conv1.kernel"], atol=1e-7)
@@ -276,7 +276,7 @@ def test_fine_tuning_starts_from_the_weights(whole, data, tmp_path):
 
 def test_fine_tuning_at_another_scale(whole, data, tmp_path):
     """Nothing in the weights depends on the scale."""
-    options = {"steps": 1, "init": whole / "weights.safetensors", "scale": 4, "learning_rate": 1e-9}
+    options = {"steps": 1, "init": (str(whole / "weights.safetensors"),), "scale": 4, "learning_rate": 1e-9}
     tiny_method.train(data, tmp_path / "out", **options)
     arrays, header = load_weights(tmp_path / "out" / "weights.safetensors")
     assert header["scale"] == 4
@@ -383,17 +383,17 @@ class TestErrors:
         """Their numbers count, until there is a checkpoint; then the file may go."""
         file, out = tmp_path / "first.safetensors", tmp_path / "out"
         shutil.copy(whole / "weights.safetensors", file)
-        tiny_method.train(data, out, steps=2, init=file)
+        tiny_method.train(data, out, steps=2, init=(str(file),))
         moved = file.rename(tmp_path / "moved.safetensors")
-        tiny_method.train(data, out, steps=2, init=moved)
-        tiny_method.train(data, out, steps=2, init=file)
+        tiny_method.train(data, out, steps=2, init=(str(moved),))
+        tiny_method.train(data, out, steps=2, init=(str(file),))
         with pytest.raises(JaxsrError, match=r"init: \w{12} -> null"):
             tiny_method.train(data, out, steps=2)
         shutil.copy(out / "weights.safetensors", file)
         with pytest.raises(JaxsrError, match=r"init: \w{12} -> \w{12}"):
-            tiny_method.train(data, out, steps=2, init=file)
+            tiny_method.train(data, out, steps=2, init=(str(file),))
         with pytest.raises(JaxsrError, match=r"none.safetensors: no such file"):
-            tiny_method.train(data, tmp_path / "new", steps=2, init=tmp_path / "none.safetensors")
+            tiny_method.train(data, tmp_path / "new", steps=2, init=(str(tmp_path / "none.safetensors"),))
 
     def test_other_data(self, whole, tmp_path):
         make_sequence(tmp_path / "data" / "other", frames=4)
