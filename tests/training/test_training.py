@@ -24,7 +24,7 @@ from jaxsr.io.images import read_png
 from jaxsr.methods import Network, fusion_sr, variant
 from jaxsr.methods.image_loss import ImageLoss
 from jaxsr.progress import Bar
-from jaxsr.training import TrainConfig
+from jaxsr.training import TrainConfig, command
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
 from jaxsr.training.data import open_data
