@@ -30,10 +30,10 @@ def demo(
     """Upscale and extrapolate the sample that ships with jaxsr; write frames, videos, metrics and a page.
 
     Args:
-        out: folder for everything that is made.
-        scale: of the low-resolution frames to start from, 2 or 4.
-        scenes: only these of the sample's scenes, by name.
-        lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes longer than all the rest.
+        out: the folder for all results.
+        scale: the scale of the low-resolution frames, 2 or 4.
+        scenes: names of the scenes to use; the default is all scenes of the sample.
+        lpips: also measure LPIPS, if the extra `perceptual` is installed; this takes most of the time.
     """
     from rich.console import Console
 
@@ -55,14 +55,14 @@ def inspect(
     sequence: Positional[Path],
     json: bool = False,
 ) -> None:
-    """Look through a sequence: buffers, motion convention, jitter, and what each method lacks.
+    """Check a sequence: buffers, motion convention, jitter, and the buffers that each method lacks.
 
-    Exits with 0 if methods can use it, 1 if something in it is wrong (all of that is listed), 2 if it cannot
-    be read as a sequence.
+    The exit status is 0 if methods can use the sequence, 1 if something in it is wrong (all faults are
+    listed), and 2 if it cannot be read as a sequence.
 
     Args:
-        sequence: folder of the sequence.
-        json: print the findings for machines instead of people.
+        sequence: the folder of the sequence.
+        json: print the findings as JSON for a program.
     """
     from jaxsr.inspection.inspect import inspect as inspect_sequence
     from jaxsr.inspection.inspect import print_report
@@ -94,13 +94,15 @@ def compare(
     """Measure folders of frames against the truth and write the comparison page.
 
     Args:
-        folders: one per method: PNG (as shown) or EXR (linear colour) frames, matched by number.
-        truth: the true frames; a sequence will do.
-        out: folder for the page and the metrics.
-        exposure: factor on linear colour before the tone map; that of the truth, else 1.
-        fps: speed at which the page plays at first.
-        lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes most of the time.
-        lpips_alex: measure LPIPS over AlexNet too, which no network is trained with.
+        folders: one folder per method, with PNG (display colour) or EXR (linear colour) frames; frames are
+            matched by their number.
+        truth: a folder with the true frames, or a sequence.
+        out: the folder for the page and the metrics.
+        exposure: the factor on linear colour before the tone map; the default is the exposure of the truth,
+            or 1 if the truth has none.
+        fps: the speed at which the page plays at first, in frames per second.
+        lpips: also measure LPIPS, if the extra `perceptual` is installed; this takes most of the time.
+        lpips_alex: also measure LPIPS with AlexNet, which no training loss uses.
     """
     from rich.console import Console
 
@@ -136,13 +138,13 @@ def upscale(
     """Upscale a sequence, and make the frames that were not rendered.
 
     Args:
-        sequence: folder of the sequence.
+        sequence: the folder of the sequence.
         method: nearest, bilinear, bicubic, taau, guided, guided-taau or fusion-sr; or a file of weights.
-        scale: of the low-resolution frames to start from; 0 takes the largest there is, 1 takes the
-            high-resolution frames and makes only those between.
+        scale: the scale of the low-resolution frames. 0 takes the largest scale of the sequence. 1 takes the
+            high-resolution frames and makes only the frames between them.
         every: every n-th frame counts as rendered; the others are extrapolated.
-        out: folder for `exr/` (linear), `png/` (as shown) and run.json; frames of another run are not
-            mixed in.
+        out: the folder for `exr/` (linear colour), `png/` (display colour) and `run.json`. A folder
+            that holds the frames of another run is refused.
     """
     from jaxsr.io.sequence import Sequence
     from jaxsr.runtime.load import find_method
@@ -156,7 +158,7 @@ def upscale(
             opened, ready, out, scale=scale, every=every, advance=progress("frames", len(opened))
         )
     print(
-        f"{len(opened)} frames in {out}: {timing.median_ms:.1f} ms a frame, "
+        f"{len(opened)} frames in {out}: {timing.median_ms:.1f} ms per frame, "
         f"compiled in {timing.compile_s:.1f} s"
     )
 
@@ -175,19 +177,19 @@ def evaluate(
 ) -> None:
     """Run methods over sequences and measure them: tables, the comparison page, metrics of every frame.
 
-    Each metric is over all pixels, over edges, and over disocclusions. What is finished is kept: an
-    interrupted evaluation goes on when the same command is run again.
+    Each metric is measured over all pixels, over edges, and over disocclusions. Finished results are kept:
+    the same command continues an interrupted evaluation.
 
     Args:
         sequences: folders of sequences with truth, or folders that hold such folders.
-        methods: names, or files of weights (*.safetensors), with spaces between.
-        scale: of the low-resolution frames to start from.
+        methods: names of methods, or files of weights (*.safetensors), separated by spaces.
+        scale: the scale of the low-resolution frames.
         every: every n-th frame counts as rendered; the others are extrapolated.
-        frames: first and last frame; all by default.
-        warmup: number of frames at the start of each sequence that are made and not measured.
-        lpips: measure LPIPS too, if the extra `perceptual` is installed; it takes most of the time.
-        lpips_alex: measure LPIPS over AlexNet too, which no network is trained with.
-        out: folder for everything that is made.
+        frames: the first and the last frame; the default is all frames.
+        warmup: the number of frames at the start of each sequence that are made but not measured.
+        lpips: also measure LPIPS, if the extra `perceptual` is installed; this takes most of the time.
+        lpips_alex: also measure LPIPS with AlexNet, which no training loss uses.
+        out: the folder for all results.
     """
     from rich.console import Console
 
@@ -227,22 +229,23 @@ def render(
     blender: Path | None = None,
     threads: int | None = None,
 ) -> None:
-    """Render a .blend to a sequence: colour and G-buffers, high-resolution and jittered low-resolution.
+    """Render a .blend file to a sequence: colour and G-buffers, high-resolution and jittered low-resolution.
 
-    An interrupted render goes on where it stopped when it is run again.
+    The same command continues an interrupted render.
 
     Args:
         scene: a .blend file.
-        out: folder of the sequence.
-        frames: first and last frame; all by default.
+        out: the folder of the sequence.
+        frames: the first and the last frame; the default is the range of the scene.
         scale: one or more factors between high and low resolution; 1 renders high resolution only.
-        size: width and height; the scene's by default.
-        samples: of the colour; the scene's by default.
-        denoise: denoise the colour; the scene's choice by default.
-        position: store world positions too; without them they are rebuilt from depth and camera.
-        seed: of the renderer's noise.
-        blender: a Blender program, or a Python that has the bpy module; else JAXSR_BLENDER, else `blender`.
-        threads: of the renderer; all cores by default.
+        size: width and height of the high resolution; the default is the size in the scene.
+        samples: samples per pixel of the colour; the default is the number in the scene.
+        denoise: denoise the colour; the default is the setting of the scene.
+        position: also store world positions; without them readers rebuild them from depth and camera.
+        seed: the seed of the renderer's noise.
+        blender: a Blender program, or a Python that has the bpy module. The default is the program in the
+            variable JAXSR_BLENDER, and then `blender`.
+        threads: the number of threads of the renderer; the default is all cores.
     """
     from jaxsr.blender.render import Progress as RenderProgress
     from jaxsr.blender.render import render as render_scene
@@ -269,7 +272,7 @@ def render(
             threads=threads,
             progress=show,
         )
-    print(f"{out}: look through it with `jaxsr inspect {out}`")
+    print(f"The sequence is in {out}. Check it with `jaxsr inspect {out}`.")
 
 
 @app.command
@@ -281,14 +284,15 @@ def convert_weights(
     buffers: tuple[str, ...] = (),
     half: bool = False,
 ) -> None:
-    """Convert published weights (.pth, .npz, .safetensors) to jaxsr's. No code in them runs.
+    """Convert published weights (.pth, .npz, .safetensors) to jaxsr's format. Code in the file is not run.
 
     Args:
         source: the published file.
         out: the file to write, ending in .safetensors.
-        method: that the weights are for, fusion-sr, rcan or rrn; by default their names tell which.
-        scale: that they were trained for; 4, where their shapes do not tell.
-        buffers: fusion-sr's G-buffer channels, in order, where it has not all of them in the paper's order.
+        method: the method of the weights: fusion-sr, rcan or rrn. By default the names of the arrays decide.
+        scale: the scale that the weights were trained for. By default the shapes of the arrays decide; the
+            scale is 4 if they cannot.
+        buffers: the G-buffer channels of fusion-sr in their order, if they differ from the paper's.
         half: store float16.
     """
     from jaxsr.weights.convert import convert_published
@@ -301,12 +305,12 @@ def convert_weights(
 @app.command(name="train")
 def _train() -> None:
     """Train the network of a method: `jaxsr train fusion-sr --help` lists the options."""
-    # `main` passes everything after "train" on: which options there are depends on the method's name.
+    # `main` passes all arguments after "train" to the trainer, because the options depend on the method.
     raise JaxsrError("no method to train", where="jaxsr train", fix="see jaxsr train --help")
 
 
 def _split_commas(values: tuple[str, ...], option: str) -> list[str]:
-    """A list as earlier versions took it, with commas between; a line on stderr says how to write it now."""
+    """Accept the commas of earlier versions in a list; a line on stderr says how to write it now."""
     parts: list[str] = []
     for value in values:
         whole = "," not in value or Path(value).exists()
@@ -335,14 +339,14 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point; exits with 2 and one line on bad input."""
     given = sys.argv[1:] if arguments is None else arguments
     for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):  # a sign that a stream cannot show is no error
+        if isinstance(stream, io.TextIOWrapper):  # a character that the stream cannot encode is no error
             stream.reconfigure(errors="backslashreplace")
     try:
         if given[:1] == ["train"]:
             from jaxsr.training.command import run
 
             return run(given[1:])
-        app.cli(prog="jaxsr", args=arguments, description="Cheap renders in, expensive-looking frames out.")
+        app.cli(prog="jaxsr", args=arguments, description="Upscale and extrapolate rendered frames.")
     except JaxsrError as error:
         print(f"jaxsr: {error}", file=sys.stderr)
         raise SystemExit(2) from None
@@ -350,13 +354,13 @@ def main(arguments: list[str] | None = None) -> None:
         print("jaxsr: interrupted", file=sys.stderr)
         if arguments is not None:  # called from Python: the caller goes on
             raise SystemExit(130) from None
-        # Tearing the interpreter down while XLA still compiles crashes; files are whole at any moment.
+        # A normal exit crashes if XLA still compiles. Files are complete at any moment, so exit at once.
         sys.stdout.flush()
         sys.stderr.flush()
         os._exit(130)
     except BrokenPipeError:  # `jaxsr inspect SEQ | head`
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise SystemExit(0) from None
-    except OSError as error:  # no space, no permission: the system's words
+    except OSError as error:  # no space, no permission: print the system's message
         print(f"jaxsr: {error.filename or ''}: {error.strerror or error}", file=sys.stderr)
         raise SystemExit(2) from None

@@ -1,6 +1,6 @@
 """Runs inside Blender: gives every material the outputs "base_color", "roughness", "metallic", "instance".
 
-Imports bpy and nothing of ours. Shading is not changed: nodes are only added. The surface is followed from
+Imports bpy and nothing of jaxsr. Shading is not changed: nodes are only added. The surface is followed from
 the active material output through reroutes, node groups, mix and add shaders down to the BSDFs, and what
 feeds their inputs is connected to (or its constant copied into) AOV output nodes. Not described: volumes,
 geometry that Geometry Nodes creates without a material, closures made by scripts (OSL).
@@ -34,13 +34,13 @@ _BSDFS = {
 
 
 class Surface(NamedTuple):
-    """What a shader looks like; each entry is a constant (float or RGBA tuple) or an output socket."""
+    """The description of a shader; each entry is a constant (float or RGBA tuple) or an output socket."""
 
     color: Any
     roughness: Any
     metallic: Any
     weightless: bool = False
-    """Emission or transparency: a mix with a real surface takes the other side's description."""
+    """Emission or transparency: in a mix with a surface, the description of the surface is used."""
 
 
 _EMITTER = Surface((1.0, 1.0, 1.0, 1.0), 1.0, 0.0, True)
@@ -52,7 +52,7 @@ def _is_socket(value: Any) -> bool:
 
 
 def _input(node: Any, name: Any) -> Any:
-    """What arrives at an input: a constant or the output socket that feeds it."""
+    """The source of an input: a constant or the output socket that feeds it."""
     if not isinstance(name, str):
         return name
     socket = node.inputs.get(name)
@@ -99,7 +99,7 @@ def _feed(tree: Any, socket: Any, value: Any) -> None:
 
 
 def _group(tree: Any, node: Any, socket: Any, cache: dict) -> Surface:
-    """Describes the shader inside a node group, then leads the description out through new group outputs."""
+    """Describes the shader inside a node group and adds group outputs for the description."""
     inner = node.node_tree
     if inner is None:
         return _NOTHING
@@ -201,7 +201,7 @@ def prepare_materials(scene: Any, view_layer: Any) -> None:
     output = default.node_tree.nodes.new("ShaderNodeOutputMaterial")
     bsdf = default.node_tree.nodes.new(
         "ShaderNodeBsdfDiffuse"
-    )  # what Cycles shows where there is no material
+    )  # the colour that Cycles uses without a material
     bsdf.inputs["Color"].default_value = (0.8, 0.8, 0.8, 1.0)
     default.node_tree.links.new(bsdf.outputs[0], output.inputs["Surface"])
     for obj in bpy.data.objects:

@@ -40,7 +40,7 @@ FILTER_WIDTH = 0.01
 
 
 class JobError(Exception):
-    """A problem of the scene or the job that the user can mend: the arguments of JaxsrError."""
+    """A fault of the scene or the job that the user can correct: the arguments of JaxsrError."""
 
     def __init__(self, what: str, **more: Any):
         self.fields = {"what": what, **{key: str(value) for key, value in more.items()}}
@@ -67,7 +67,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def exit_with_parent() -> None:
-    """The parent holds our stdin open; when it is gone, so are we."""
+    """End this process when the parent has ended: the parent holds the other end of stdin."""
 
     def wait() -> None:
         while os.read(0, 4096):
@@ -78,7 +78,7 @@ def exit_with_parent() -> None:
 
 
 def load_scene(job: dict) -> tuple[Any, dict]:
-    """Opens the .blend or builds the scene; returns it with the settings that a script declares."""
+    """Opens the .blend or builds the scene; returns the scene and the settings that a script declares."""
     source = job["scene"]
     if "blend" in source:
         if not Path(source["blend"]).is_file():
@@ -109,7 +109,7 @@ def load_scene(job: dict) -> tuple[Any, dict]:
 
 
 def plan(scene: Any, settings: dict, job: dict) -> dict:
-    """Fills in what the job leaves to the scene, checks it, and returns the complete description."""
+    """Takes the values that the job leaves open from the scene, checks them, and returns the complete job."""
     where = job["scene"].get("blend") or job["scene"].get("script")
     if scene.camera is None:
         raise JobError("the scene has no camera", where=where, fix="set scene.camera")
@@ -155,7 +155,7 @@ def plan(scene: Any, settings: dict, job: dict) -> dict:
 
 
 def set_up(scene: Any, job: dict) -> None:
-    """Everything that stays the same over the clip."""
+    """Sets up what is constant over the clip."""
     render, cycles = scene.render, scene.cycles
     render.engine = "CYCLES"
     cycles.device = "CPU"
@@ -238,7 +238,7 @@ def camera_now(camera: Any, size: list[int]) -> dict:
     """The camera at the current frame in jaxsr's conventions (view space x right, y down, z forward)."""
     graph = bpy.context.evaluated_depsgraph_get()
     world = camera.evaluated_get(graph).matrix_world.copy()
-    columns = [world.col[i].to_3d().normalized() for i in range(3)]  # as Cycles, which drops the scale
+    columns = [world.col[i].to_3d().normalized() for i in range(3)]  # Cycles ignores the scale too
     x, y, z, origin = columns[0], -columns[1], -columns[2], world.translation
     p = projection(camera, size)
     return {
@@ -311,7 +311,7 @@ class Renderer:
             self.own_shift[camera.name_full] = (camera.data.shift_x, camera.data.shift_y)
         now = camera_now(camera, size)
         cut = now["name"] != before["name"]
-        if cut:  # Vector compares with where the new camera was one frame ago
+        if cut:  # the Vector pass uses the new camera's position one frame ago
             scene.frame_set(frame - 1)
             before = camera_now(camera, size)
             scene.frame_set(frame)
@@ -398,4 +398,4 @@ if __name__ == "__main__":
     after = sys.argv[sys.argv.index("--") + 1 :] if "--" in sys.argv else sys.argv[1:]
     code = main(after)
     sys.stdout.flush()
-    os._exit(code)  # Blender's own tear-down can crash after a persistent render; everything is written
+    os._exit(code)  # all files are written; Blender's own exit can crash after a persistent render

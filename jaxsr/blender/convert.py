@@ -20,7 +20,7 @@ SKY_DEPTH = 1e9
 
 
 class Instances(NamedTuple):
-    """What tells instances apart: Blender gives all instances of an object the same pass index."""
+    """The data that separate instances: Blender gives all instances of an object the same pass index."""
 
     objects: int
     """Largest pass index."""
@@ -51,7 +51,8 @@ def sky_motion(
     """
     sky = np.full((size[1], size[0], 1), np.inf)
     motion = still_motion(sky, camera, previous, jitter_px, np)
-    return np.where(motion < -BEHIND_PX / 2, motion, 0.0)  # it is about -BEHIND_PX where there was no pixel
+    # About -BEHIND_PX means that there was no previous pixel.
+    return np.where(motion < -BEHIND_PX / 2, motion, 0.0)
 
 
 def convert_color(raw: Mapping[str, np.ndarray]) -> Float[np.ndarray, "h w 3"]:
@@ -120,7 +121,8 @@ def _object_ids(raw: Mapping[str, np.ndarray], instances: Instances | None) -> F
     value = _channel(raw, "instance", "XV").astype(np.float64)
     rank = np.searchsorted((table[1:] + table[:-1]) / 2, value)
     known = np.abs(table[rank] - value) < 2.0**-22
-    late = len(table) + np.floor(value * 2**20)  # appeared after the first frame: numbered by their random id
+    # Instances that appeared after the first frame get a number from their random id.
+    late = len(table) + np.floor(value * 2**20)
     return np.where(
         np.isin(ids, np.asarray(instances.instanced)),
         instances.objects + 1 + np.where(known, rank, late),

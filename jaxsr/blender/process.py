@@ -40,7 +40,8 @@ def find_blender(path: str | Path | None = None) -> Blender:
     """The Blender to use: `path`, else $JAXSR_BLENDER, else `blender` on PATH, else this Python's bpy.
 
     Raises:
-        JaxsrError: there is none, or the one named does not run or lacks bpy; says how to make one.
+        JaxsrError: there is no Blender, or the named program does not run or lacks bpy;
+            the message says how to install one.
     """
     named, where = (path, "--blender") if path else (os.environ.get("JAXSR_BLENDER"), "JAXSR_BLENDER")
     if named:
@@ -86,7 +87,7 @@ def _probe(executable: str, where: str) -> Blender:
 
 
 class BlenderProcess:
-    """The Blender process: started on entry; on exit, however that comes about, it is gone."""
+    """The Blender process: it starts on entry and has always ended after the exit, also after an error."""
 
     def __init__(self, program: Blender, job: Mapping[str, Any], folder: Path, log: Path):
         self.program, self.log = program, log
@@ -134,7 +135,7 @@ class BlenderProcess:
             raise self._failure() from e
 
     def scene(self) -> dict[str, Any]:
-        """What the script found in the scene, with the job's gaps filled."""
+        """The complete description of the job, with the values that the script read from the scene."""
         for event in self.events():
             if event["event"] == "scene":
                 return {k: v for k, v in event.items() if k not in ("event", "cpu_seconds")}
@@ -179,7 +180,7 @@ def _writing(path: Path) -> Iterator[None]:
 
 
 def last_meaningful_line(log: str) -> str | None:
-    """The line of Blender's output that most likely says what went wrong."""
+    """The line of Blender's output that most likely names the error."""
     noise = re.compile(
         r"^\s*$|Saved:|^Fra:|\| (WARNING|INFO)|^Blender (quit|\d)|^\s+(File|at) |^\s|^Color management"
     )

@@ -31,7 +31,7 @@ JITTER_LENGTH = 32
 
 
 class Progress(NamedTuple):
-    """How far a render is; a frame counts in proportion to the work of its images."""
+    """The progress of a render; a frame counts in proportion to the work of its images."""
 
     done_frames: float
     total_frames: int
@@ -76,12 +76,12 @@ def render(
         seed: of Cycles' noise.
         threads: of Blender; None for all cores.
         name, license: written to sequence.json; the name defaults to the scene's.
-        position: store the world position too (else it is rebuilt from depth when it is asked for).
+        position: also store the world position (otherwise readers rebuild it from depth).
         scene_arguments: of a Python scene's `build`.
         precision, round_bits: see SequenceWriter.
         blender: see `find_blender`.
         log: what Blender prints; None for `out/blender.log`.
-        progress: called after each image with a Progress. What it raises ends the render; it can be resumed.
+        progress: called after each image with a Progress. If it raises, the render ends; it can be resumed.
 
     Returns:
         `out`.
@@ -142,7 +142,7 @@ def render(
             round_bits=round_bits,
         )
         first, last = described["frames"]
-        # A frame that began a range is a reset: it is made again when the frames before it come to be.
+        # The first frame of a range is a reset. It is made again once the frames before it are rendered.
         done = [
             f
             for f in range(first, last + 1)
@@ -163,7 +163,7 @@ def render(
 
 @contextlib.contextmanager
 def _tidied(out: Path, log: Path) -> Iterator[None]:
-    """After an error before anything was rendered, leave nothing but a log that the message names."""
+    """After an error before the first image, remove everything but the log that the message names."""
     had_log, had_out = log.exists(), out.exists()
     try:
         yield

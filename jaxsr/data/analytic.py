@@ -3,7 +3,7 @@
 It is ray cast in NumPy float64 with one sample per pixel, so that every buffer is exact: depth, motion,
 normals, object ids and whether a point was visible one frame before. The camera turns and travels, a sphere
 rolls, a panel slides and a thin pole stands in front. Buffers obey `jaxsr.frames`; layer names are those of
-sequences on disk. It is no renderer: there is no anti-aliasing and no indirect light. Time is counted in
+sequences on disk. There is no anti-aliasing and no indirect light. Time is counted in
 frames and lengths in units of the world (z is up). Unlike elsewhere in jaxsr, sizes are (width, height).
 """
 
@@ -40,7 +40,7 @@ class Material:
 class Sphere:
     """A textured ball that moves evenly, in units per frame, and spins about its vertical axis.
 
-    "Local" points are those at time 0: a point of the surface keeps its local position for ever.
+    "Local" points are those at time 0: the local position of a surface point never changes.
     """
 
     center: tuple[float, float, float]
@@ -271,7 +271,7 @@ def frame(
         The frame, unbatched, its arrays NumPy float32, and the HR colour, linear and unjittered.
 
     Raises:
-        JaxsrError: `size` is no whole multiple of `scale`.
+        JaxsrError: `size` is not a whole multiple of `scale`.
     """
     if scale < 1 or size[0] % scale or size[1] % scale:
         raise JaxsrError(

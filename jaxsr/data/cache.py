@@ -1,15 +1,15 @@
-"""Sequences as memory-mapped arrays: decoding OpenEXR costs far more than a training step's crop of it.
+"""Sequences as memory-mapped arrays, because training needs crops and decoding whole OpenEXR files is slow.
 
 Each resolution of a sequence ("hr", "x2", ...) is converted once, when it is first asked for, to one file
 `[N, H, W, C]` per layer in the type of the OpenEXR channels, under
 
     <cache>/<name of the folder>-<hash of its path>/<resolution>-<key>/   color.npy depth.npy ... arrays.json
 
-The key is made of the bytes of `sequence.json` and the sizes and times of the frames' files: a sequence that
-was changed is converted again, and what was made of its earlier state is deleted. A conversion is written
-under a temporary name and renamed when it is whole; processes that convert the same one at the same time do
-not disturb each other. Pixels are checked as `Sequence` does, but a bad layer stops only those who need it:
-`arrays.json` keeps what is wrong with it. Positions are not kept: no frame has them.
+The key is a hash of the bytes of `sequence.json` and of the sizes and times of the frames' files: a changed
+sequence is converted again, and the arrays of its earlier state are deleted. A conversion is written under a
+temporary name and renamed when it is complete; processes that convert the same one at the same time do
+not disturb each other. Pixels are checked as in `Sequence`, but a bad layer is an error only for methods that
+need it: `arrays.json` records the fault. Positions are not converted, because no frame has them.
 """
 
 import contextlib
@@ -46,7 +46,7 @@ class Arrays(NamedTuple):
     absent: dict[str, int]
     """Layer that some frames have and others lack -> the number of the first frame that lacks it."""
     broken: dict[str, dict[str, str]]
-    """Layer with values that cannot be meant -> what is wrong, as arguments of `JaxsrError`."""
+    """Layer with invalid values -> the fault, as arguments of `JaxsrError`."""
 
 
 def default_cache() -> Path:
@@ -61,13 +61,13 @@ def open_arrays(
     cache: Path | None = None,
     progress: Progress = silent,
 ) -> dict[str, Arrays]:
-    """Memory maps of a sequence, which is converted first where that was not done yet.
+    """Memory maps of a sequence; it is converted first if there is no conversion yet.
 
     Args:
         path: the folder of the sequence.
         resolutions: some of "hr", "x2", ...
         cache: folder of the arrays; `default_cache()` by default.
-        progress: told of each frame that is converted.
+        progress: called for each converted frame.
 
     Returns:
         Resolution -> its arrays.
@@ -80,7 +80,7 @@ def open_arrays(
     home = (default_cache() if cache is None else Path(cache)) / _name(seq.path)
     found = {}
     for resolution in resolutions:
-        seq.layers(resolution)  # says which there are, if this is none
+        seq.layers(resolution)  # the error for an unknown resolution lists the known ones
         found[resolution] = _open(seq, resolution, home, progress)
     return found
 
@@ -89,7 +89,7 @@ def source_key(seq: Sequence, resolution: str, times: bool = True) -> str:
     """A hash that changes with `sequence.json` and with the files of a resolution.
 
     Args:
-        times: count the times of modification in, which change when files are copied.
+        times: include the times of modification, which change when files are copied.
     """
     digest = hashlib.sha256(f"{_VERSION} {resolution}\n".encode())
     try:
@@ -180,11 +180,14 @@ def _frames(seq: Sequence, resolution: str) -> Iterator[dict[str, np.ndarray]]:
 
 
 class _LayerFile:
-    """A `.npy` file that grows by a frame at a time. Not a writable memory map: a full disk would kill us."""
+    """A `.npy` file that grows frame by frame; a writable memory map would crash on a full disk."""
 
     def __init__(self, path: Path, frames: int):
         self.path, self.frames = path, frames
-        self.seen, self.count = False, 0  # whether any frame has the layer; how many do, from the first on
+        self.seen, self.count = (
+            False,
+            0,
+        )  # whether any frame has the layer; how many frames from the first on have it
         self.shape: tuple[int, ...] = ()
         self.dtype: np.dtype = np.dtype(np.float16)
         self.file: BinaryIO | None = None
@@ -198,7 +201,7 @@ class _LayerFile:
     def append(self, i: int, pixels: np.ndarray) -> None:
         self.seen = True
         if self.count < i:
-            return  # an earlier frame lacks the layer: it is of no use
+            return  # an earlier frame lacks the layer, so no method can use it
         if self.file is None:
             self.shape, self.dtype = pixels.shape, _storable(pixels.dtype)
             self._begin()
@@ -240,7 +243,7 @@ def _storable(dtype: np.dtype) -> np.dtype:
 
 
 def _remove_stale(home: Path, resolution: str, keep: Path) -> None:
-    """Delete what was made of earlier states of the sequence, and what killed conversions left."""
+    """Delete the arrays of earlier states of the sequence and the leftovers of killed conversions."""
     for old in home.glob(f"{resolution}-*"):
         if old != keep:
             shutil.rmtree(old, ignore_errors=True)

@@ -1,10 +1,10 @@
-"""Which convention do buffers follow? Hypotheses are tried on the pixels, and the data chooses.
+"""Find the conventions that buffers follow: try each reading on the pixels and compare the errors.
 
-Pure NumPy functions on `[H, W, C]` arrays of two consecutive images; no files, no text for people (that is
-`jaxsr.inspection.inspect`). Motion: the previous image (base colour or colour, normals, disparity) is warped
-by every reading of the stored vectors and compared with the current one; camera and depth say apart from that
-where points that stand still must have been. Jitter: the LR G-buffer is looked up in the HR one. Errors are
-capped, so that disocclusions and moving shadows cannot outvote the rest.
+Pure NumPy functions on `[H, W, C]` arrays of two consecutive images; they read no files and print
+nothing (see `jaxsr.inspection.inspect`). Motion: the previous image (base colour or colour, normals,
+disparity) is warped by every reading of the stored vectors and compared with the current image; independently
+of that, camera and depth give the previous position of static points. Jitter: the LR G-buffer is looked up in
+the HR one. Errors are capped, so that disocclusions and moving shadows do not dominate the mean.
 """
 
 import itertools
@@ -71,7 +71,7 @@ class MotionEvidence:
     """Errors of the conventions on one pair of frames."""
 
     moves: bool
-    """Some stored vector is not zero."""
+    """True if any stored vector is not zero."""
     camera_px: float
     """How far the camera alone moves points, median in pixels."""
     image_change: float
@@ -79,11 +79,11 @@ class MotionEvidence:
     image: dict[MotionConvention, float] = field(default_factory=dict)
     """Warp error relative to no motion."""
     camera: dict[MotionConvention, float] = field(default_factory=dict)
-    """Median distance in pixels to where a point that stands still must have been."""
+    """Median distance in pixels to the previous position of a static point."""
 
 
 def features(layers: Layers, scale: np.ndarray | None = None) -> np.ndarray:
-    """What stays with a surface as it moves: base colour (else log colour), normal, disparity; 0 for sky."""
+    """Properties that move with a surface: base colour (else log colour), normal, disparity; 0 for sky."""
     planes = []
     textured = "base_color" in layers and _gradient(layers["base_color"]).mean() > 1e-3
     if textured:
@@ -99,12 +99,12 @@ def features(layers: Layers, scale: np.ndarray | None = None) -> np.ndarray:
 
 
 def finite_or_zero(x: np.ndarray) -> np.ndarray:
-    """float64, with 0 for NaN and Inf: faults are counted elsewhere, and must not stop the judging."""
+    """float64, with 0 for NaN and Inf, which are counted elsewhere and must not stop this test."""
     return np.nan_to_num(x.astype(np.float64), posinf=0, neginf=0)
 
 
 def is_sky(depth: np.ndarray) -> np.ndarray:
-    """`[H, W, 1]`: infinite depth, or so large that it can only mean that."""
+    """`[H, W, 1]`: infinite depth, or a depth so large that it must mean sky."""
     return ~(depth < 1e9)
 
 
@@ -128,7 +128,7 @@ def motion_evidence(
         current, previous: layers `[H, W, C]`: depth and motion, and base_color, normal, color where there.
         info, info_previous: their cameras, if they are known.
         jitter_delta: jitter of the previous image minus that of the current one, in their pixels.
-        samples: how many pixels are looked at.
+        samples: the number of pixels to compare.
     """
     h, w = current["depth"].shape[:2]
     directions = {
@@ -158,7 +158,8 @@ def motion_evidence(
         expected = np.full((len(p), 2), np.nan)
         if known:
             expected = static_motion(here["depth"], info_here, info_there)[p[:, 1], p[:, 0]]
-        shift = np.asarray(jitter_delta) * (-1 if forward else 1)  # p - shift shows there what p shows here
+        # p - shift in the other image shows the same point as p.
+        shift = np.asarray(jitter_delta) * (-1 if forward else 1)
         still = _error(target, f_there, p - shift)
         cap = 2 * float(still.mean())
         none = float(np.minimum(still, cap).mean())
@@ -177,7 +178,7 @@ def motion_evidence(
 
 
 def static_motion(depth: np.ndarray, info: FrameInfo, info_previous: FrameInfo) -> np.ndarray:
-    """`[h, w, 2]`: backward motion, in pixels, of points that stand still; 0 for sky."""
+    """`[h, w, 2]`: backward motion, in pixels, of static points; 0 for sky."""
     sky = is_sky(depth)
     return np.where(sky, 0, still_motion(np.where(sky, np.inf, depth), info, info_previous, xnp=np))
 
@@ -206,7 +207,7 @@ def camera_evidence(
         depth, motion_px: `[h, w, 1]` and `[h, w, 2]`, the motion already converted to jaxsr's convention.
 
     Returns:
-        (camera, depth) -> error; 0 is perfect, 1 no better than no motion.
+        (camera, depth) -> error; 0 is perfect, 1 is as bad as no motion.
     """
     h, w = depth.shape[:2]
     solid = ~is_sky(depth)[..., 0]
@@ -247,11 +248,11 @@ def jitter_evidence(
     Returns:
         reading -> error (about LR pixels; empty if the images are flat), and the jitter that fits best.
     """
-    lr = {k: v for k, v in lr.items() if k != "color"}  # colour may be noisy, and lit otherwise
+    lr = {k: v for k, v in lr.items() if k != "color"}  # colour may be noisy or lit differently
     hr = {k: v for k, v in hr.items() if k != "color"}
     shared = set(lr) & set(hr)
     f_lr, f_hr = (features({k: x[k] for k in shared}) for x in (lr, hr))
-    if f_lr.shape[-1] != f_hr.shape[-1]:  # one of them has a base colour without texture
+    if f_lr.shape[-1] != f_hr.shape[-1]:  # the base colour of one image has no texture
         f_lr, f_hr = (features({k: x[k] for k in shared - {"base_color"}}) for x in (lr, hr))
     weight = normalise(f_hr) / scale
     f_lr, f_hr = f_lr * weight, f_hr * weight
@@ -273,7 +274,7 @@ def jitter_evidence(
 
     best = np.array(JITTERS[min(errors, key=lambda n: errors[n])](x, y, scale))
     slope = (_gradients(f_hr)) * scale
-    for _ in range(8):  # Gauss-Newton on the better part of the pixels
+    for _ in range(8):  # Gauss-Newton on the pixels with the smaller errors
         r = residual(best)
         keep = np.abs(r).sum(-1) <= np.quantile(np.abs(r).sum(-1), 0.6)
         at = (p + best + 0.5) * scale - 0.5
@@ -307,7 +308,7 @@ def lr_motion_evidence(
     solid = ~is_sky(lr["depth"]).ravel() & ~is_sky(hr["depth"])[at[:, 1], at[:, 0], 0]
     if not solid.any() or not np.abs(m[solid]).max() > 1e-7:
         return {}
-    # MV_J,t = MV_N,t + J_{t-1} - J_t (METHODS 1)
+    # MV_J,t = MV_N,t + J_{t-1} - J_t (docs/conventions.md)
     delta = np.asarray(jitter_previous, float) - np.asarray(jitter_px, float)
     return {
         name: float(np.median(np.linalg.norm(stored - read(m, scale, delta), axis=-1)[solid]))
@@ -326,7 +327,7 @@ NORMALS = {
 
 
 def normal_evidence(depth: np.ndarray, normal: np.ndarray, info: FrameInfo) -> dict[str, float]:
-    """Median angle in degrees between stored normals, read in several ways, and the surface seen in depth."""
+    """Median angle in degrees between stored normals, read in several ways, and the surface in the depth."""
     position = world_from_depth(np.where(is_sky(depth), np.inf, depth), info, xnp=np)
     dx, dy = position[1:-1, 2:] - position[1:-1, :-2], position[2:, 1:-1] - position[:-2, 1:-1]
     surface = np.cross(dx, dy)
@@ -352,7 +353,7 @@ def normal_evidence(depth: np.ndarray, normal: np.ndarray, info: FrameInfo) -> d
 
 
 def _blur(x: np.ndarray) -> np.ndarray:
-    """Two 3x3 binomials: point samples of fine texture alias, and would drown sub-pixel differences."""
+    """Two 3x3 binomials: point samples of fine texture alias, which would hide sub-pixel differences."""
     for _ in range(2):
         for axis in (0, 1):
             padded = np.pad(x, [(1, 1) if a == axis else (0, 0) for a in range(3)], mode="edge")

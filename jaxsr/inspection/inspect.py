@@ -1,8 +1,8 @@
-"""Look through a sequence: what is in it, whether it means what jaxsr takes it for, what is missing.
+"""Check a sequence: its buffers, whether they follow jaxsr's conventions, and which buffers are missing.
 
 `inspect` reads frames (all, or evenly chosen stretches of a long sequence), counts, and tries conventions
-(`jaxsr.inspection.conventions`); faults become findings, not exceptions, except where there is no sequence
-at all. It changes nothing. `print_report` shows it to a person, `Report.to_json` to a machine.
+(`jaxsr.inspection.conventions`); faults become findings; only a folder that is not a sequence
+raises. No file is changed. `print_report` prints the report, `Report.to_json` returns it as plain values.
 """
 
 import dataclasses
@@ -40,7 +40,7 @@ from jaxsr.layers import LAYERS, channels
 
 @dataclass
 class Report:
-    """What `inspect` found."""
+    """The result of `inspect`."""
 
     path: str
     name: str
@@ -48,11 +48,11 @@ class Report:
     scales: tuple[int, ...]
     frames: int
     frames_read: list[int]
-    """Indices of the frames that were looked at."""
+    """Indices of the frames that were read."""
     findings: list[Finding]
     buffers: list[BufferStats]
     missing: dict[str, list[str]]
-    """Method -> buffers that it needs and the sequence lacks."""
+    """Method -> the buffers that it needs and that the sequence lacks."""
 
     def finding(self, topic: str) -> Finding:
         """The finding on "files", "motion", "camera", "depth", "normal", "jitter x2", "LR motion x2", ..."""
@@ -76,8 +76,8 @@ def inspect(
 
     Args:
         sequence: open it with `check=False`, or NaN and Inf raise instead of being counted.
-        needs: method -> buffers such as "lr.color", "hr.base_color"; to say which methods can run.
-        max_frames: how many frames are read at most; pairs of neighbours, evenly spread.
+        needs: method -> its buffers, such as "lr.color" or "hr.base_color", to report which methods can run.
+        max_frames: the largest number of frames to read; they are pairs of neighbours, evenly spread.
     """
     evidence, faults = Evidence(), []
     stats: dict[tuple[str, str], BufferStats] = {}
@@ -204,13 +204,13 @@ def _read(sequence: Sequence, i: int, resolution: str, stats: dict) -> dict[str,
 
 
 def _main(sequence: Sequence, images: Mapping[str, Mapping[str, np.ndarray]]) -> str | None:
-    """The largest resolution that has depth and motion in this frame: they are judged there."""
+    """The largest resolution that has depth and motion in this frame; both are tested there."""
     places = sorted(sequence.resolutions, key=lambda r: 1 if r == "hr" else int(r[1:]))
     return next((p for p in places if images.get(p, {}).keys() >= {"depth", "motion"}), None)
 
 
 def _judge_matrices(sequence: Sequence) -> list[Finding]:
-    """A finding if a camera is not rigid; opening a sequence without checks lets it through."""
+    """A finding if a camera is not rigid, which opening a sequence without checks accepts."""
     faults = []
     for info in sequence.infos:
         try:
@@ -270,7 +270,7 @@ def _pair(
 def _absent(
     sequence: Sequence, layers: Mapping[str, Mapping[int, Set[str]]]
 ) -> dict[tuple[str, str], JaxsrError]:
-    """The layers that some frames have and others lack: by resolution and layer, the first that lacks it."""
+    """Layers that only some frames have: resolution and layer -> the first frame that lacks it."""
     found = {}
     for resolution, of in layers.items():
         for layer in LAYERS:
@@ -285,7 +285,7 @@ def _absent(
 def _lacks(
     sequence: Sequence, wanted: set[str], whole: Set[tuple[str, str]], somewhere: Set[tuple[str, str]]
 ) -> list[str]:
-    """Of the wanted buffers those that not every frame has, and that cannot be derived.
+    """The wanted buffers that some frames lack and that cannot be derived.
 
     Args:
         whole, somewhere: resolutions and layers that all frames have, and that some have.

@@ -1,4 +1,4 @@
-"""From evidence to verdicts that a person understands: what fits, how sure that is, what to do.
+"""Verdicts from the evidence: which convention fits, how sure this is, and what to do.
 
 Functions of `Evidence` (collected over the frames by `jaxsr.inspection.inspect`); no files.
 """
@@ -19,14 +19,14 @@ Level = Literal["ok", "warn", "bad"]
 TIE = 1.15
 """Two readings whose errors differ by less than this factor cannot be told apart."""
 OFF_PX = 0.12
-"""Measured jitter may differ this much: fine texture is aliased in the buffers it is measured on."""
+"""Measured jitter may differ by this much, because fine texture is aliased in the measured buffers."""
 FORWARD_TIE = 1.4
 """The same for forward and backward motion of otherwise one reading."""
 
 
 @dataclass
 class Finding:
-    """One verdict. `level`: "ok", "warn" (cannot tell, or may be meant), "bad" (methods would go wrong)."""
+    """One verdict. `level`: "ok", "warn" (undecided, or perhaps intended), "bad" (methods would go wrong)."""
 
     topic: str
     level: Level
@@ -87,7 +87,7 @@ def judge_files(sequence: Sequence, chosen: list[int], faults: list[str]) -> Fin
 
 
 def judge_values(stats: Mapping[Any, BufferStats], evidence: Evidence) -> list[Finding]:
-    """Numbers that cannot be meant: NaN, Inf, negative depth, colours of surfaces outside 0..1."""
+    """Invalid values: NaN, Inf, negative depth, colours of surfaces outside 0..1."""
     wrong: list[str] = []
     odd: list[str] = []
     for b in stats.values():
@@ -113,7 +113,7 @@ def judge_values(stats: Mapping[Any, BufferStats], evidence: Evidence) -> list[F
 
 
 def judge_motion(evidence: list[cv.MotionEvidence]) -> tuple[Finding, cv.MotionConvention | None]:
-    """Which convention fits; None where there is no telling."""
+    """The convention that fits, or None if it cannot be decided."""
     if not evidence:
         return Finding("motion", "warn", "cannot tell: no two consecutive frames"), None
     change = float(np.mean([e.image_change for e in evidence]))
@@ -139,7 +139,7 @@ def judge_motion(evidence: list[cv.MotionEvidence]) -> tuple[Finding, cv.MotionC
         c: float(np.exp(np.mean([np.log(s[c]) for s in scores]))) for c in cv.CONVENTIONS if c in scores[0]
     }
     best = min(total, key=lambda c: total[c])
-    # Of equals take ours, then the backward one: under constant motion forward looks like backward.
+    # Among equals prefer jaxsr's, then backward: under constant motion forward looks like backward.
     if total[cv.CANONICAL] <= TIE * total[best]:
         best = cv.CANONICAL
     backward = dataclasses.replace(best, forward=False)
@@ -187,7 +187,7 @@ def _scores(e: cv.MotionEvidence) -> dict[cv.MotionConvention, float]:
     """Image error relative to no motion, times the camera's where the camera explains the motion."""
     best = min(e.camera.values())
     explains = e.camera_px > 0.05 and best < 0.15 * e.camera_px
-    # Where even the best is off, camera or depth are not exact, and small differences mean nothing.
+    # If even the best error is large, camera or depth are inexact and small differences mean nothing.
     floor = 0.002 + 0.003 * e.camera_px + 4 * best
     return {
         c: (image + 1e-3) * ((e.camera[c] + floor) / (e.camera_px + floor) if explains else 1.0)
@@ -198,7 +198,7 @@ def _scores(e: cv.MotionEvidence) -> dict[cv.MotionConvention, float]:
 def judge_camera(
     sequence: Sequence, pairs: list[tuple[int, dict[str, np.ndarray]]], convention: cv.MotionConvention | None
 ) -> Finding:
-    """Does what stands still move as camera and depth say? Needs a motion whose convention is known."""
+    """Whether static points move as camera and depth say; this needs motion of a known convention."""
     if not pairs or convention is None or convention.forward:
         return Finding("camera and depth", "warn", "cannot tell without backward motion that is understood")
     i, hr = pairs[0]

@@ -1,6 +1,6 @@
 """One image of a sequence in few bytes: quantisation, then lossless coding of integer planes.
 
-What `decode_frame` returns differs from what `encode_frame` was given by at most this:
+The output of `decode_frame` differs from the input of `encode_frame` by at most this:
 
 | layer | stored as | error |
 |---|---|---|
@@ -44,7 +44,7 @@ CODES = {
     "metallic": (1, "|u1"),
     "object_id": (1, "<u2"),
 }
-"""Layer -> the planes that it is stored as: how many, and their type."""
+"""Layer -> the number and the type of the planes that store it."""
 _DAMAGES = (
     ValueError, KeyError, TypeError, IndexError, AttributeError, OverflowError, struct.error, lzma.LZMAError,
 )  # fmt: skip
@@ -55,7 +55,7 @@ _FILTERS = [{"id": lzma.FILTER_LZMA2, "preset": 6, "lc": 4, "lp": 0, "pb": 0}]
 
 
 def quantise_color(color: np.ndarray, bits: int) -> np.ndarray:
-    """Half floats as 16-bit integers of which the low `10 - bits` mantissa bits are rounded off."""
+    """Half floats as 16-bit integers, with the low `10 - bits` bits of the mantissa rounded off."""
     half = np.clip(color, 0, 65504 * (1 - 2.0**-9)).astype(np.float16).view(np.uint16).astype(np.uint32)
     drop = 10 - bits
     return ((half + ((1 << drop) >> 1)) >> drop).astype(np.uint16)
@@ -100,7 +100,7 @@ def restore_normal(code: np.ndarray, sky: np.ndarray) -> np.ndarray:
 def predicted_motion(
     depth: np.ndarray, info: FrameInfo, before: FrameInfo, jitter: tuple[float, float]
 ) -> np.ndarray:
-    """Motion of a world that stands still, from depth `[h, w]`.
+    """Motion of static points under the motion of the camera, from depth `[h, w]`.
 
     Only differences from it are stored, so every step is part of the format: sky lies at 1e7, positions are
     rounded to float32, depth before the previous camera is at least 1e-3, and motion at most 4096 pixels.
@@ -137,7 +137,7 @@ def _unpredict(residual: np.ndarray, kind: int) -> np.ndarray:
 
 
 def encode_plane(plane: np.ndarray) -> tuple[dict[str, Any], bytes]:
-    """One unsigned integer plane to bytes, and what is needed to undo it."""
+    """The bytes of one unsigned integer plane, and the notes that decoding needs."""
     signed = np.dtype(f"i{plane.dtype.itemsize}")
 
     def zigzag(x: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ def encode_plane(plane: np.ndarray) -> tuple[dict[str, Any], bytes]:
 
 
 def decode_plane(note: Mapping[str, Any], packed: bytes, shape: tuple[int, int]) -> np.ndarray:
-    """The inverse of `encode_plane`; never decompresses more than a plane of this shape needs."""
+    """The inverse of `encode_plane`; never decompresses more bytes than a plane of this shape has."""
     dtype, kind = np.dtype(note["dtype"]), note["kind"]
     if kind not in range(4):
         raise ValueError(f"predictor {kind!r}")
@@ -190,7 +190,7 @@ def encode_frame(
     jitter: tuple[float, float],
     color_bits: int,
 ) -> bytes:
-    """All layers of one image; `before` is the frame before (or `info` again where there is none)."""
+    """All layers of one image; `before` is the previous frame (`info` itself if there is none)."""
     depth, limits = quantise_depth(layers["depth"][..., 0])
     codes: dict[str, np.ndarray] = {"depth": depth[..., None]}
     still = predicted_motion(restore_depth(depth, limits), info, before, jitter)
@@ -222,7 +222,7 @@ def encode_frame(
 
 
 def largest_blob(shape: tuple[int, int]) -> int:
-    """Bytes of an image `(h, w)` at most: the notes, and planes that could not be made smaller."""
+    """The largest number of bytes of an image `(h, w)`: the notes, and planes that do not compress."""
     per_pixel = sum(channels * np.dtype(dtype).itemsize for channels, dtype in CODES.values())
     return (1 << 20) + 2 * per_pixel * shape[0] * shape[1]
 
@@ -240,12 +240,12 @@ def decode_frame(
 
     Args:
         blob: what `encode_frame` returned, or anything else.
-        shape: the height and width that it must have.
+        shape: the height and width that the image must have.
         info, before, jitter: those that `encode_frame` was given.
         where: the place that errors name.
 
     Raises:
-        JaxsrError: it is not an image of this shape.
+        JaxsrError: the bytes are not an image of this shape.
     """
     try:
         codes, notes = _decode_codes(blob, shape)

@@ -52,7 +52,7 @@ def _save(array: np.ndarray, **options: Any) -> bytes:
 
 
 def flip_jpeg(error: np.ndarray) -> bytes:
-    """A FLIP map [H, W] in [0, 1] as a small grey JPEG; it is looked at, never measured."""
+    """A FLIP map [H, W] in [0, 1] as a small grey JPEG; it is only displayed, never measured."""
     grey = np.rint(np.clip(error, 0.0, 1.0) * 255.0).astype(np.uint8)
     return _save(grey, format="JPEG", quality=70, optimize=True)
 
@@ -87,7 +87,7 @@ def decoded_error(image: np.ndarray, file: bytes) -> np.ndarray:
 
 
 class Images:
-    """The images of a page, each once: tasks share the truth, methods share the input.
+    """The images of a page, each stored once: tasks share the truth, methods share the input.
 
     Only what was given is kept: of a path the path, so that memory does not grow with the number of frames.
     """

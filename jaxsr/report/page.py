@@ -1,4 +1,4 @@
-"""The comparison page: one HTML file with everything in it, which opens from disk and asks for nothing else.
+"""The comparison page: one HTML file with everything in it, which opens from disk and loads nothing else.
 
 Images are embedded at the best quality that keeps the page below a size (`embedding.py`), and the page says
 which that is and how large the error of the encoding is. Metrics on the page were measured before encoding;
@@ -28,7 +28,7 @@ from jaxsr.report.results import REGIONS, SequenceResult
 from jaxsr.report.tables import Scores, groups, json_value, mean_scores, rows, scores
 
 MAX_MEGABYTES = 18.0
-"""Default aim for the size of the page."""
+"""Default target for the size of the page."""
 
 
 def _keys(names: Iterable[str]) -> list[str]:
@@ -219,7 +219,7 @@ def write_report(
         title: heading and window title.
         meta: device, versions, commit, date, settings; shown as given, nested mappings flattened.
         fps: speed at which the page plays at first.
-        max_megabytes: aim for the size (10^6 bytes) of the page. It decides how images are encoded; where
+        max_megabytes: target for the size (10^6 bytes) of the page. It decides how images are encoded; where
             even JPEG is too large, only every n-th frame gets images.
 
     Returns:

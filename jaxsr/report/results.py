@@ -47,7 +47,7 @@ class MethodResult:
     cost: Cost | None = None
 
     def over(self, region: str) -> Mapping[str, Values]:
-        """The metrics over the pixels of a region, "all" or one of `regions`; none if it was not measured."""
+        """The metrics over the pixels of a region, "all" or one of `regions`; empty if not measured."""
         return self.metrics if region == ALL else self.regions.get(region, {})
 
 
@@ -57,17 +57,17 @@ class SequenceResult:
 
     title: str
     frames: Sequence[int]
-    """Numbers of the frames, as files and people name them."""
+    """Numbers of the frames, as in the file names."""
     truths: Sequence[ImageOrPath]
     methods: Sequence[MethodResult]
     inputs: Sequence[ImageOrPath | None] = ()
-    """What the methods were given, at its own size; None for a frame that was not rendered."""
+    """The input of the methods at render size; None for a frame that was not rendered."""
     extrapolated: Sequence[bool] = ()
-    """True for frames that no method saw rendered; empty if there are none."""
+    """True for frames that every method had to extrapolate; empty if there are none."""
     exposure: float = 1.0
     meta: Mapping[str, Any] = field(default_factory=dict)
     task: str = ""
-    """Sections of one task, not empty, are averaged too: sequences under the same conditions."""
+    """Sections with the same task are also averaged; an empty task is not."""
 
     def __post_init__(self) -> None:
         n = len(self.frames)

@@ -1,9 +1,10 @@
 """Results as a table, Markdown, JSON and CSV.
 
 A mean runs over the finite values of the frames. Identical frames (infinite PSNR) are left out of it and
-counted beside it; were they all identical, the mean is infinite. Spread is the standard deviation over the
-frames (of the population, 0 for one frame): how much frames differ, not an uncertainty of the mean. Sections
-of one task are averaged once more: each counts the same however long it is, and the spread is over sections.
+counted separately; if all frames are identical, the mean is infinite. Spread is the standard deviation over
+the frames (of the population, 0 for one frame): it says how much frames differ, not how uncertain the mean
+is.
+Sections of one task are averaged again: each has the same weight, and the spread is over sections.
 
 JSON has no infinity: it is written as the string "inf". None is null.
 """
@@ -58,7 +59,7 @@ def summarise(values: Values) -> Summary:
 
 
 def summary(result: MethodResult, key: str, positions: Sequence[int], region: str = ALL) -> Summary:
-    """`summarise` of metric `key` of a method at some positions; nothing defined if the method lacks it."""
+    """`summarise` for the metric `key` of a method at some positions; undefined if the method lacks it."""
     values = result.over(region).get(key)
     return summarise([] if values is None else [values[i] for i in positions])
 
@@ -76,7 +77,7 @@ def _winners(means: Mapping[str, float | None], key: str) -> set[str]:
 
 @dataclass(frozen=True)
 class Line:
-    """What a table says of one method."""
+    """The row of one method in a table."""
 
     name: str
     note: str
@@ -93,7 +94,7 @@ class Scores:
     subset: str
     region: str
     count: str
-    """Over how many frames or sequences."""
+    """The number of frames or sequences in each mean."""
     keys: Sequence[str]
     lines: Sequence[Line]
 
@@ -163,14 +164,14 @@ def all_scores(sections: Sequence[SequenceResult], brief: bool = False) -> Itera
 
 
 def number(value: float | None, digits: int) -> str:
-    """A value as people read it: "31.42", "∞", or "–" where it is not defined."""
+    """A value as text: "31.42", "∞", or "–" where it is not defined."""
     if value is None:
         return "–"
     return "∞" if math.isinf(value) else f"{value:.{digits}f}"
 
 
 def cell(values: Summary, key: str, spread: bool = True) -> str:
-    """Mean ± spread, and the identical frames that are not in it (a star if without spread)."""
+    """Mean ± spread, and the number of identical frames left out (only a star if without spread)."""
     digits = METRICS[key].digits
     text = number(values.mean, digits)
     if values.spread is not None and values.frames > 1 and spread:
@@ -386,14 +387,14 @@ def as_csv(sections: Sequence[SequenceResult]) -> str:
 
 
 def check_results_folder(out: Path, *others: str) -> None:
-    """See that no results in a folder are those of another program, before any work is done.
+    """Refuse a folder with results of another program, before any work is done.
 
     Args:
-        out: where results go; it may not be there yet.
-        others: names in it that will be written beside the page and the metrics.
+        out: the folder of the results; it may not exist yet.
+        others: names of the files that will be written beside the page and the metrics.
 
     Raises:
-        JaxsrError: not a folder; a file of the name of a result, without a metrics.json of jaxsr beside it.
+        JaxsrError: not a folder; or a file has the name of a result and there is no metrics.json of jaxsr.
     """
     fix = "choose another folder with --out"
     if out.exists() and not out.is_dir():

@@ -1,6 +1,6 @@
 """Labelled frames side by side as an H.264 video that any player shows.
 
-Pixels are repeated, never filtered, so that what is seen is what a method made. yuv420p halves the
+Pixels are repeated, never filtered, so that the video shows the exact output of a method. yuv420p halves the
 resolution of chroma and the encoder is lossy (CRF 16): a video is for looking at motion, not for measuring.
 """
 
@@ -92,7 +92,7 @@ def write_video(
         path: the file, ending in ".mp4".
         columns: label -> display-referred frames [H, W, 3] in [0, 1] or PNG files, equal in size and number.
         fps: frames per second.
-        scale: every pixel is repeated so often in x and y; by default as often as 1920 pixels of width allow.
+        scale: how often each pixel is repeated in x and y; by default as often as fits into a width of 1920.
         per_row: images in a row; by default all.
         captions: one text per frame, shown beside the first label, for instance "frame 12, extrapolated".
         advance: called after each frame, for a progress bar.
