@@ -1,4 +1,4 @@
-"""Writes docs/data_card.md from the sequences on disk and the measured noise floors; invents nothing."""
+"""Writes docs/data_card.md from the sequences on disk and the measured noise floors."""
 
 import json
 from pathlib import Path
@@ -31,7 +31,7 @@ no textures or models from elsewhere. Licence of all pictures: {license}.
 HR colour (the truth) and HR G-buffer without jitter; LR colour and LR G-buffer at each scale, jittered by
 Halton (2, 3) of length 32. The G-buffer: linear depth, backward motion, world normal, base colour, roughness,
 metallic, object id. All are point samples at pixel centres: no anti-aliasing, motion blur, depth of field or
-tone mapping. The G-buffer is a render of its own at one sample a pixel; colour has the samples below.
+tone mapping. The G-buffer is a render of its own at one sample per pixel; colour has the samples below.
 
 ## Sequences
 

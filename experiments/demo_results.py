@@ -59,7 +59,7 @@ def task_of(section: SequenceResult) -> str:
 
 
 def table(sections: list[SequenceResult], task: str) -> list[str]:
-    """One table a task: every metric of every method, a block of lines for each scene."""
+    """One table per task: every metric of every method, a block of lines for each scene."""
     chosen = [s for s in sections if task_of(s) == task]
     keys = chosen[0].metric_keys()
     lines = [
@@ -91,7 +91,7 @@ README = {
 
 
 def readme_block(document: dict[str, Any]) -> str:
-    """The results of README: a row a method, a column a scene, from the numbers in demo.json."""
+    """The results of README: one row per method, one column per scene, from the numbers in demo.json."""
     keys = [key for key in README if key in document["sections"][0]["tracks"][0]["metrics"]]
     names = " · ".join(README[key][0] for key in keys)
     lines = []

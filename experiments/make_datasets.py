@@ -8,7 +8,7 @@
 
 Sequences lie at `DIR/<set>/<scene>-<split>-<clip>`. `render` and `unpack` look for an archive (`*.jsrz`) in
 `--search`, then in `../shared/datasets` beside the repository, and never render what an archive holds; both
-resume. `floor` goes on clip by clip, but measures again what is there; `card` and `pack` begin anew.
+resume. `floor` works clip by clip and measures every clip again; `card` and `pack` start from the beginning.
 Training and test clips have camera paths and scene layouts of their own: they share no frames. All is
 deterministic for a seed, whatever the number of threads.
 """
@@ -77,11 +77,11 @@ class Render:
     """HR size; 384x216 for the sample, 512x288 for the others."""
     scales: tuple[int, ...] = (2, 4)
     clips: int | None = None
-    """Clips a scene, at most those of the set."""
+    """Clips per scene, at most those of the set."""
     frames: int | None = None
-    """Frames a clip, at most those of the set."""
+    """Frames per clip, at most those of the set."""
     samples: int | None = None
-    """Samples a pixel; the scene's own by default."""
+    """Samples per pixel; the default is the number of the scene."""
     seed: int = 0
     budget_minutes: float = math.inf
     threads: int | None = None
@@ -314,7 +314,7 @@ def _colors(
 
 
 def measure_floor(config: Floor, bars: Bars) -> None:
-    """The verb `floor`: one entry a scene, split and clip in the results, replaced when measured again."""
+    """The verb `floor`: one entry per scene, split and clip in the results, replaced when measured again."""
     check_scenes(config.scenes)
     clips = [Clip(s, split, c, 12) for s in config.scenes for split in config.splits for c in config.clips]
     bar = bars.start("floor", 2 * len(clips) * len(config.frames), unit="frame")

@@ -9,9 +9,9 @@ display colour over the whole frame, the mean over all pairs and scenes.
 
 TAAU and guided TAAU: coordinate search over their options on the super-resolution of whole clips, every scale
 of the sequences alike, all frames but the first two. The three frames of the sample's training part are too
-few for that: a history takes longer to form.
+few for that, because a history forms over more frames.
 
-Test frames are not touched. Writes experiments/results/tune_<what>.json, .md and a figure. The defaults of
+Test frames are not used. It writes experiments/results/tune_<what>.json, .md and a figure. The defaults of
 `jaxsr.ops.reproject` are the optimum, those in `jaxsr.methods` lie within 0.15 dB of it: a longer memory than
 the best PSNR asks for keeps still images steadier.
 """
@@ -72,7 +72,7 @@ class Config:
     data: Path | None = None
     """Folder with training sequences; the sample's training part by default."""
     clips: int = 1
-    """Clips a scene, for TAAU."""
+    """Clips per scene, for TAAU."""
     rounds: int = 1
     """Passes over the constants of TAAU."""
     out: Path = RESULTS

@@ -1,11 +1,11 @@
-"""Pictures of the networks against the other methods, as the paper's Figures 6 to 8: one a scene.
+"""Pictures of the networks and the other methods, as in the paper's Figures 6 to 8: one per scene.
 
     python experiments/fusion_sr/figures.py [--network fusion-sr | fusion-sr-{scene} | FILE.safetensors]
 
 Runs the methods over the test clips of the sample and writes docs/images/fusion_sr_<scene>.png: the truth of
 one frame with two crops marked, and the crops of the input, of what each method made, and of the truth.
-Beneath are PSNR and LPIPS of that whole frame, the best in black. The crops are not picked by hand: they are
-where the squared error summed over all methods is largest.
+PSNR and LPIPS of that whole frame stand below, with the best in black. The crops are not picked by hand: they
+lie where the squared error, summed over all methods, is largest.
 """
 
 import sys
@@ -33,7 +33,7 @@ from jaxsr.runtime.upscale import display  # noqa: E402
 
 METHODS = ("bicubic", "taau", "guided-taau")
 COLORS = ((230, 60, 50), (40, 150, 255))
-"""Of the two crops."""
+"""Colours of the two crops."""
 PARTS = (6, 4.5)
 """A crop is this much narrower and lower than the frame."""
 TILE, GAP, LINE = 192, 4, 17
@@ -48,7 +48,7 @@ class Config:
     frame: int = 6
     """Position in the clip, counted from 1; the temporal methods see those before it."""
     scenes: tuple[str, ...] = ()
-    """Of the sample; all by default."""
+    """Scenes of the sample; the default is all."""
     out: Path = ROOT / "docs" / "images"
 
 
@@ -97,7 +97,7 @@ def crops(shown: Sequence[Shown]) -> list[tuple[int, int, int, int]]:
     for _ in COLORS:
         y, x = (int(v) for v in np.unravel_index(np.argmax(sums), sums.shape))
         found.append((x, y, x + width, y + height))
-        # A crop's breadth between them: the same thing twice tells nothing.
+        # The second crop lies at least one crop width away, so that it shows something else.
         sums[max(y - 2 * height + 1, 0) : y + 2 * height, max(x - 2 * width + 1, 0) : x + 2 * width] = -1
     return found
 

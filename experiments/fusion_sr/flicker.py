@@ -1,23 +1,24 @@
-"""Figure 9: a lamp changes its colour on every frame; who looks at past frames shows the old one.
+"""Figure 9: a lamp changes its colour on every frame, and methods with a history show the old colour.
 
     python experiments/fusion_sr/flicker.py [--runs DIR]
 
-Reads what the methods of `study.py` made of the bunker's test clip, all of its frames, from the folder of the
-runs (seed 0). For each frame t and tile, c is the mean colour of the truth, p that of the previous truth
-warped to it by the motion: what history holds there. Tiles count where |p - c| is more than `CHANGE` (RMS
+Reads all output frames of the methods of `study.py` on the bunker's test clip from the folder of the runs
+(seed 0). For each frame t and tile, c is the mean colour of the truth, p that of the previous truth
+warped to it by the motion, which is the colour in the history. Tiles count
+where |p - c| is more than `CHANGE` (RMS
 over channels), that is where the lamp shines and has changed; those that are disoccluded by more than a tenth
 (`HIDDEN`) do not. With o the mean colour that a method made and m the mean of the truth's over the whole
 clip, least squares over the tiles of a frame give
 
     o - c = old (p - c) + average (m - c) + rest
 
-`old` is 0 where no colour comes from the frame before, 1 where all of it does; `average` is how far a method
-washes the lamp out, as a network does that has not learned its colours. Blur within a tile and other errors
-count as neither. Display-referred.
+`old` is 0 if no colour comes from the previous frame and 1 if all of it does. `average` says how much a
+method replaces the lamp's colour by its mean, as a network does that has not learned the colours. Blur
+within a tile and other errors are in neither. All colours are display-referred.
 
-Writes experiments/results/fusion_sr/flicker.json and .md, docs/images/fusion_flicker_strip.png, a row a
-method and a column a frame, docs/images/fusion_flicker.png, the curves, and its part of
-docs/results_fusion_sr.md.
+Writes experiments/results/fusion_sr/flicker.json and .md, docs/images/fusion_flicker_strip.png (one
+row per method, one column per frame), docs/images/fusion_flicker.png (the curves), and the section on flicker
+of docs/results_fusion_sr.md.
 """
 
 import json
@@ -92,7 +93,7 @@ def lamp(truth: np.ndarray, before: np.ndarray, hidden: np.ndarray) -> Lamp:
 
 
 class Shares(NamedTuple):
-    """Of the colour of the lamp in what a method made; see above."""
+    """Shares of the lamp's colour in the output of a method; see above."""
 
     old: float
     average: float
@@ -164,7 +165,7 @@ def busiest(found: list[Lamp]) -> tuple[int, int]:
 
 
 def strip(rows: dict[str, np.ndarray], found: list[Lamp]) -> np.ndarray:
-    """The crops, a row a method and a column a frame, `[H, W, 3]` in 8 bits."""
+    """The crops, one row per method and one column per frame, `[H, W, 3]` in 8 bits."""
     x, y = busiest(found)
     width, height = WINDOW[0] * ZOOM, WINDOW[1] * ZOOM
     page = Image.new("RGB", (LABEL + len(FRAMES) * (width + 3), 20 + len(rows) * (height + 3)), "white")
@@ -203,7 +204,7 @@ def chart(curves: Curves, file: Path) -> None:
 
 
 def table(curves: Curves, tiles: Sequence[int]) -> list[str]:
-    """A row a method: the old colour of each frame, and both shares over the last four together."""
+    """One row per method: the old colour in each frame, and both shares over the last four."""
     frames = " | ".join(f"frame {i + 2}" for i in range(len(tiles)))
     lines = [
         f"| method | sees | {frames} | last {LAST}: old | average |",

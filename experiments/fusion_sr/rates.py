@@ -1,11 +1,11 @@
-"""Which learning rate each architecture of `study.py` gets: the best of a few after a short training.
+"""Find the learning rate of each architecture of `study.py`: the best of a few after a short training.
 
     python experiments/fusion_sr/rates.py [NAME ...] [--steps N] [--rates 1e-3 ...] [--data DIR]
 
-The judge is the SSIM of the held-back frames of the training clips, of which the loss is made for the most
-part; the test frames are not looked at. Seed 100, which no table uses. What is made of `fusion` (other
-buffers, fusion or start, one branch) has its rate. Each training becomes a file in
-experiments/results/fusion_sr/rates/ and is not made again.
+The best rate has the highest SSIM on the held-back frames of the training clips, because SSIM is most of the
+loss. The test frames are not used. The seed is 100, which no table uses. Variants of `fusion` (other buffers,
+fusion or base, one branch) have the rate of `fusion`. Each training is stored in a file in
+experiments/results/fusion_sr/rates/ and is not repeated.
 """
 
 import json
@@ -32,7 +32,7 @@ ARCHITECTURES = {
     "rrn": (600, (1e-3, 1e-4)),
     "fusion": (150, (1e-3, 3e-4)),
 }
-"""Steps and rates. RRN begins with tame weights, from which nothing much happens in the first 150 steps."""
+"""Steps and rates. RRN starts with small weights and learns little in the first 150 steps."""
 
 
 def main(

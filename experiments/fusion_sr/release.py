@@ -1,14 +1,15 @@
-"""Put trained networks into the package, with a model card each.
+"""Put trained networks into the package, with one model card per network.
 
     python experiments/fusion_sr/release.py [NAME ...] [--runs DIR]
     python experiments/fusion_sr/release.py --renew
 
 For each run of `train_released.py` that has ended: store its weights as float16 in
-`jaxsr/weights/released/NAME.safetensors`, measure that file and its rivals on the test frames of the
-sample, and write `docs/models/NAME.md` with data, budget, metrics and limits, and
+`jaxsr/weights/released/NAME.safetensors`, measure that file and the other methods on the test frames of
+the sample, and write `docs/models/NAME.md` with data, budget, metrics and limits, and
 `experiments/results/NAME.json` with every number of every frame.
 
-`--renew` gives the files that ship the header that this version of jaxsr writes. Their arrays stay.
+`--renew` rewrites the headers of the released files as this version of jaxsr writes them. The arrays do not
+change.
 """
 
 import json

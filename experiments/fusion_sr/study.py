@@ -4,16 +4,16 @@
 
 Names are those of `VARIANTS`: networks, and methods that learn nothing. Each (name, seed) is trained, then
 measured on the test clips of the sample, and becomes a file `experiments/results/fusion_sr/NAME-sSEED.json`:
-configuration, learning curve, machine, commit, and every metric of every frame. What has such a file is not
-made again (`--again`), and a training goes on where it was stopped. `tables.py` turns the files into tables.
+configuration, learning curve, machine, commit, and every metric of every frame. A run with such a file is
+skipped unless `--again` is given, and an interrupted training resumes. `tables.py` makes the tables.
 
 The same for all: windows of five frames, their order, crops and flips, number of steps, schedule, clipping,
 loss (1 - SSIM + L1 on display-referred colour), exposure, tone map, jittered input. The loss is that of the
 last frame of a window, and for RRN, which is trained through its past, the mean over all five: five times the
 pixels. The learning rate is the better of two (`rates.py`). One network for all scenes.
 
-Test frames: the last four of each clip of the sample; the four before them are shown to every method and not
-measured, as many as NSRR looks back.
+The test frames are the last four of each clip of the sample. Every method also runs on the four frames before
+them, which are not measured: NSRR uses four previous frames.
 """
 
 import csv
@@ -82,7 +82,7 @@ class Variant:
     changes: dict[str, Any] | None = None
     """Settings of the network other than the defaults; None for a method that learns nothing."""
     learning_rate: float = 1e-3
-    """By `rates.py`; of what is made of `fusion`, that of `fusion`."""
+    """Found by `rates.py`; variants of `fusion` have the rate of `fusion`."""
 
     def build(self) -> Method:
         """The method with the loss of the study, on windows of one length."""
@@ -99,7 +99,7 @@ class Variant:
 
 
 def without(*names: str) -> dict[str, Any]:
-    """The fusion network that does not see these buffers; see "fusion-zero" for why from 0."""
+    """The fusion network without these buffers; see "fusion-zero" for why from 0."""
     return ZERO | {"buffers": tuple(name for name in BUFFERS if name not in names)}
 
 
@@ -155,7 +155,7 @@ def training_clips(data: Path) -> tuple[Path, ...]:
 
 
 def results_file(name: str, seed: int, results: Path = RESULTS) -> Path:
-    """Where the numbers of a run are; of what learns nothing there is one run."""
+    """The file with the numbers of a run; a method without a network has one run."""
     return results / (f"{name}.json" if VARIANTS[name].changes is None else f"{name}-s{seed}.json")
 
 
@@ -210,7 +210,7 @@ def measure(ready: LoadedMethod, clips: list[Path], frames: Path) -> dict[str, A
 
 
 def run(name: str, seed: int, data: tuple[Path, ...], runs: Path, clips: list[Path]) -> dict[str, Any]:
-    """Train, measure, and say all that there is to say of it."""
+    """Train and measure one run, and return all that its file records."""
     variant, out = VARIANTS[name], runs / results_file(name, seed).stem
     found: dict[str, Any] = {"name": name, "label": variant.label, "method": variant.method}
     if variant.changes is None:

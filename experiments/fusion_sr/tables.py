@@ -7,7 +7,7 @@ beside the paper's), and its part of `docs/results_fusion_sr.md`. Where the fram
 folder of the runs, crops are drawn as well: `docs/images/fusion_TABLE_SCENE.png`. Nothing is measured here.
 
 A number is the mean over the measured frames of a scene, then over the seeds that all networks of the table
-were trained with; behind ± is half the distance between the lowest and the highest seed.
+were trained with; the number after ± is half the distance between the lowest and the highest seed.
 """
 
 import json
@@ -67,7 +67,7 @@ class Table:
     not_pictured: tuple[str, ...] = ()
     """Left out of the crops, which become too small otherwise."""
     reference: str = "fusion"
-    """From whose PSNR that of the others is taken."""
+    """The variant with which the PSNR of the others is compared."""
 
 
 TABLES = {
@@ -308,7 +308,7 @@ def _check_fair(here: Mapping[str, list[dict[str, Any]]]) -> None:
 
 
 def markdown(found: Mapping[str, Any]) -> list[str]:
-    """The table: a block of rows a scene, the paper's number beside each of ours."""
+    """The table: one block of rows per scene, with the paper's number beside each of ours."""
     keys = [k for k in KEYS if all(k in v["measured"] for s in found["scenes"].values() for v in s.values())]
     head = []
     for key in keys:
@@ -352,7 +352,7 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
 
 
 def chart(found: Mapping[str, Any], file: Path) -> None:
-    """PSNR and SSIM by scene: a dot a seed mean with its spread, a ring for the paper's number."""
+    """PSNR and SSIM by scene: dots are means over seeds with their spread, rings the paper's numbers."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
@@ -381,7 +381,7 @@ def chart(found: Mapping[str, Any], file: Path) -> None:
 
 
 def crops(name: str, scene: str, runs: Path) -> Path | None:
-    """Crops of what the variants of a table made of one frame; None where the frames are not there."""
+    """Crops of one output frame of each variant of a table; None if the frames do not exist."""
     table = TABLES[name]
     pictured = [variant for variant in table.variants if variant not in table.not_pictured]
     made = {v: sorted((runs / results_file(v, 0).stem / "frames").glob(f"{scene}-*/png")) for v in pictured}

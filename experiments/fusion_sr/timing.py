@@ -1,4 +1,4 @@
-"""Where the time goes: each method at 480x270 -> 1920x1080, and what Blender takes to render (Table 2).
+"""Time per frame: each method at 480x270 -> 1920x1080, and rendering with Blender (Table 2).
 
     python experiments/fusion_sr/timing.py methods [--rounds 5]
     python experiments/fusion_sr/timing.py render [--blender-path PATH] [--samples 16]
@@ -9,8 +9,8 @@ of `study.py`, and RCAN and RRN of the published sizes as well (RCAN in one roun
 
 `render` renders one frame of each test clip: HR and LR colour with so many samples, and the G-buffer, all on
 the CPU; scenes that have numbers are not rendered again (`--again`). The seconds are CPU seconds of Blender
-from one image to the next, saving included. A frame begins with its HR G-buffer, so the step from the frame
-before it falls on that; building the scene does not count.
+from one image to the next, saving included. A frame begins with its HR G-buffer, whose time includes the
+change from the previous frame; building the scene does not count.
 
 Both write into experiments/results/fusion_sr/ (runtime and render, .json and .md), docs/images/ and
 docs/results_fusion_sr.md.
@@ -208,7 +208,7 @@ def render(
 
 
 def render_chart(found: dict[str, Any], runtime: dict[str, Any], file: Path) -> None:
-    """A bar a scene and way: G-buffer, LR colour and network on top of each other, beside HR colour."""
+    """One bar per scene and way: G-buffer, LR colour and network on top of each other, beside HR colour."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

@@ -1,4 +1,4 @@
-"""Train the networks that ship with the package; each run goes on where it was stopped.
+"""Train the networks that ship with the package; an interrupted run resumes.
 
     python experiments/fusion_sr/train_released.py [NAME ...] [--data DIR] [--runs DIR]
 
