@@ -498,6 +498,7 @@ def test_digests_of_methods_are_stable_and_their_own():
     assert len(set(runs[0])) == len(METHODS)
 
 
+@pytest.mark.slow
 def test_digests_see_what_functions_hold():
     def made(value):
         return lambda x: x + value

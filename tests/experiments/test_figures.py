@@ -10,6 +10,7 @@ from jaxsr.runtime.load import find_method
 from tests.builders import make_sequence, random_weights
 
 
+@pytest.mark.slow
 def test_a_figure_is_written(tmp_path):
     sequence = make_sequence(tmp_path / "hall-test-0", frames=2)
     random_weights(tmp_path / "net-hall.safetensors", scale=2)

@@ -153,6 +153,7 @@ def test_streaming_equals_scan(name):
     np.testing.assert_allclose(np.stack(streamed(name)), images, rtol=2e-4, atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_jit_equals_eager(name):
     frames, state = clip(), method_of(name).init(clip()[0])
@@ -325,6 +326,7 @@ def test_rcan_s_loss_is_that_of_the_last_frame():
     assert set(parts) == {"l1", "ssim"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_it_learns_one_window(name):
     """From where training begins, not where `drawn` does: RRN's tame weights take a hundred steps to wake."""
@@ -449,6 +451,7 @@ def test_help_has_one_scale(capsys):
         assert "Take the jitter out" in out
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_train_upscale_and_evaluate(name, tmp_path, capsys):
     make_sequence(tmp_path / "data" / "clip", frames=5)

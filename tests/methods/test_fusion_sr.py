@@ -267,6 +267,7 @@ def test_the_network_is_told_the_offset():
 # The step.
 
 
+@pytest.mark.slow
 def test_streaming_equals_scan():
     frames = clip()
     run = jax.jit(lambda net, s, fs: jax.lax.scan(functools.partial(step(method_of("default")), net), s, fs))
@@ -274,6 +275,7 @@ def test_streaming_equals_scan():
     np.testing.assert_allclose(np.stack(streamed()), images, rtol=2e-4, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_jit_equals_eager():
     frame = clip()[0]
     with jax.disable_jit():
@@ -502,6 +504,7 @@ def training(name):
     return params, rest, optimizer.init(params), update
 
 
+@pytest.mark.slow
 def test_residuals_may_begin_at_zero():
     def scales(**options):
         net = fusion_sr.method(fusion_sr.Options(**options)).network.new(nnx.Rngs(0))
@@ -512,6 +515,7 @@ def test_residuals_may_begin_at_zero():
     fusion_sr.method(fusion_sr.Options(residual="zero", fusion="concat")).network.new(nnx.Rngs(0))  # has none
 
 
+@pytest.mark.slow
 def test_the_loss_falls_on_one_window():
     params, rest, opt, update = training("default")
     seen = window(frame_at(0), frame_at(2))

@@ -68,6 +68,7 @@ def test_streaming_equals_scan(name):
     np.testing.assert_allclose(np.stack(outputs(name, 2, 4, 2)), images, rtol=2e-4, atol=2e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["bilinear", "taau", "guided", "guided-taau"])
 def test_jit_equals_eager(name):
     frames, _ = clip(2, 4, 2)

@@ -125,6 +125,7 @@ def test_padding_is_no_samples():
     np.testing.assert_allclose(run(state, current, previous), padded[:, :6, :9], atol=1e-5)
 
 
+@pytest.mark.slow
 def test_jit_is_eager_and_batches_are_images():
     run, state = compiled(1)
     current, previous = maps(3, (6, 5), 1, batch=2)
@@ -390,6 +391,7 @@ def test_streaming_equals_scan():
     np.testing.assert_allclose(made, images, rtol=2e-4, atol=2e-4)
 
 
+@pytest.mark.slow
 def test_jit_equals_eager():
     frames = clip(2)
     with jax.disable_jit():
@@ -512,6 +514,7 @@ def training():
     return params, optimizer.init(params), update
 
 
+@pytest.mark.slow
 def test_the_loss_falls_on_one_window():
     params, opt, update = training()
     frames, truths = zip(*(frame_at(t) for t in (1, 2, 3)), strict=True)

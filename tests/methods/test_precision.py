@@ -8,6 +8,7 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from jax.sharding import NamedSharding, PartitionSpec
 
 from jaxsr.data import analytic
@@ -75,12 +76,14 @@ def run_64(code, *arguments):
     return done.stdout.split()
 
 
+@pytest.mark.slow
 def test_every_method_runs_in_both_precisions():
     """The image has the type of the frames, and the state keeps its types, or `scan` would refuse it."""
     out = run_64(METHODS_64)
     assert out == [word for name in METHODS for dtype in ("float32", "float64") for word in (name, dtype)]
 
 
+@pytest.mark.slow
 def test_a_training_step_runs(tmp_path):
     assert run_64(TRAINING_64, tmp_path)[-1].endswith("weights.safetensors")
 

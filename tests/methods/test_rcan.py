@@ -80,6 +80,7 @@ def test_gradients_are_finite_and_reach_everything():
         assert np.any(leaf != 0), path
 
 
+@pytest.mark.slow
 def test_it_begins_tame():
     """Sixty blocks deep, as the published one begins: activations do not grow from block to block."""
     net = small(scale=2, groups=3, blocks=20, features=16, rngs=nnx.Rngs(0))

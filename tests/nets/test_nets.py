@@ -114,6 +114,7 @@ def test_padding_repeats_the_border(make):
     np.testing.assert_allclose(run(state, color, gbuffer), run(state, *padded)[:, :6], atol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NETS)
 def test_jit_is_eager_and_batches_are_images(name):
     net = drawn(functools.partial(NETS[name], down_kernel=2, buffers=("normal", "depth")), 1)
@@ -182,6 +183,7 @@ def test_batch_norm_trains_by_batch_and_infers_by_its_running_mean():
     np.testing.assert_allclose(run(after, color, gbuffer), last, atol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [FusionSR, functools.partial(UNetSR, down_kernel=2)])
 def test_gradients_are_finite_and_reach_everything(make):
     graph, params, rest = nnx.split(drawn(make, 5), nnx.Param, ...)
@@ -213,6 +215,7 @@ def test_bfloat16_computes_close_by(name):
     assert 0 < difference < 0.03
 
 
+@pytest.mark.slow
 def test_bfloat16_trains():
     net = drawn(functools.partial(FusionSR, dtype=jnp.bfloat16), 6)
     graph, params, rest = nnx.split(net, nnx.Param, ...)
@@ -223,6 +226,7 @@ def test_bfloat16_trains():
     assert all(x.dtype == jnp.float32 and np.all(np.isfinite(x)) for x in jax.tree.leaves(grads))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", [FusionSR, UNetSR])
 def test_it_learns_one_image(make):
     y, x = jnp.mgrid[:8, :8].astype(jnp.float32) / 8

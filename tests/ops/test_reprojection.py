@@ -54,7 +54,7 @@ def test_reproject_is_the_loop(size, seed, sigma_guide, sigma_space):
 
 @pytest.mark.parametrize(
     ("strides", "radius", "count"),
-    [((1,), 0, 4), ((2,), 1, 1), ((1, 3, 5, 9), 1, 9), ((1, 4), 3, 5)],
+    [((1,), 0, 4), ((2,), 1, 1), ((1, 3, 5, 9), 1, 9), pytest.param((1, 4), 3, 5, marks=pytest.mark.slow)],
 )
 def test_any_neighbourhood_is_the_loop(strides, radius, count):
     inputs = _inputs(count, 17, 19)
@@ -65,6 +65,7 @@ def test_any_neighbourhood_is_the_loop(strides, radius, count):
     assert _assert_is(result, expected, atol=2e-4) < 0.02
 
 
+@pytest.mark.slow
 def test_reproject_is_the_plain_jax_form_with_its_gradients():
     inputs = tuple(jnp.asarray(a) for a in _inputs(1, 23, 21))
     cotangents = _inputs(2, 23, 21)[0], _inputs(3, 23, 21, c=1)[0]

@@ -169,7 +169,10 @@ FUSION_SR = fusion_sr.method(loss=ImageLoss(perceptual_weight=0.0))
     [
         pytest.param(tiny_method.method(), id="tiny"),
         pytest.param(FUSION_SR, id="fusion-sr", marks=pytest.mark.slow),
-        *(pytest.param(variant(name, SMALL[name] | {"scale": 2}), id=name) for name in SMALL),
+        *(
+            pytest.param(variant(name, SMALL[name] | {"scale": 2}), id=name, marks=pytest.mark.slow)
+            for name in SMALL
+        ),
     ],
 )
 def test_two_devices_train_as_one(data, method):
@@ -305,6 +308,7 @@ def test_weights_of_other_settings_are_noted(data, tmp_path, capsys):
     )
 
 
+@pytest.mark.slow
 def test_the_sample_is_the_default(tmp_path):
     """Its training frames are unpacked into the cache, once."""
     out, cache = tmp_path / "out", tmp_path / "cache"
