@@ -1,7 +1,7 @@
 """Frames from arrays that a user has: what is left out is filled in, and what is wrong is said.
 
-`jaxsr.Frame.of` is the way in. Arrays may be NumPy's or JAX's. Values are looked at only where they are
-known, not inside a function that is being compiled.
+`jaxsr.Frame.of` is the way in. Arrays may be NumPy's or JAX's, and are brought to one type. Values are looked
+at only where they are known, not inside a function that is being compiled.
 """
 
 from collections.abc import Mapping
@@ -45,8 +45,8 @@ def make_frame(
     if small is None:
         assert large is not None  # `_scale` has seen to it
         small = (large[0] // factor, large[1] // factor)
-    like = next((x for x in (*low.values(), *high.values())), None)
-    dtype = np.float32 if like is None else like.dtype
+    dtype = _common_dtype([x.dtype for x in (*low.values(), *high.values())])
+    low, high = ({name: _cast(x, dtype) for name, x in images.items()} for images in (low, high))
     color = low.pop("color", None)
     return Frame(
         color_linear=np.zeros((*small, 3), dtype) if color is None else color,  # type: ignore[arg-type]
@@ -64,6 +64,19 @@ def make_frame(
 def _known(x: Any) -> bool:
     """Whether the values of an array can be looked at."""
     return not isinstance(x, jax.core.Tracer)
+
+
+def _common_dtype(dtypes: list[Any]) -> Any:
+    """One type for a whole frame: float64 where an array has it, else float32.
+
+    Half precision would not do: the steps compute pixel coordinates in the type of the colour.
+    """
+    return np.float64 if np.dtype(np.float64) in dtypes else np.float32
+
+
+def _cast(x: Any, dtype: Any) -> Any:
+    """The array in this type, or in the nearest that JAX allows."""
+    return x.astype(jax.dtypes.canonicalize_dtype(dtype) if isinstance(x, jax.Array) else dtype)
 
 
 def _images(images: Images, place: str) -> dict[str, Any]:
@@ -131,7 +144,7 @@ def _scale(small: tuple[int, int] | None, large: tuple[int, int] | None, scale: 
                 expected="an LR buffer, or scale",
                 fix="give scale=, the HR size over the LR size",
             )
-        small = (large[0] // scale, large[1] // scale)
+        small = (max(large[0] // scale, 1), max(large[1] // scale, 1))
     factor = max(large[0] // small[0], 1)
     if large != (small[0] * factor, small[1] * factor) or scale not in (None, factor):
         raise JaxsrError(

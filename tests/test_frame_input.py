@@ -66,9 +66,18 @@ def test_the_colour_of_a_frame_that_was_not_rendered_is_hidden():
 
 def test_numbers_keep_their_precision():
     assert Frame.of(**arguments(color=np.ones((*LR, 3), np.float64))).color_linear.dtype == np.float64
-    assert Frame.of(**arguments(color=jnp.ones((*LR, 3), jnp.bfloat16))).color_linear.dtype == jnp.bfloat16
     frame = Frame.of(**arguments(lr={"object_id": np.ones(LR, np.uint32)}))
     assert frame.lr.object_id.dtype == np.float32
+
+
+@pytest.mark.parametrize("dtype", [jnp.bfloat16, jnp.float16])
+def test_half_precision_becomes_float32(dtype):
+    """Pixel coordinates are computed in the type of the colour, and half precision cannot hold them."""
+    frame = Frame.of(**arguments(color=jnp.ones((*LR, 3), dtype), depth=np.ones((*LR, 1), np.float16)))
+    assert {x.dtype for x in (frame.color_linear, frame.lr.depth_linear, frame.hr.depth_linear)} == {
+        np.dtype(np.float32)
+    }
+    assert frame.jitter_px.dtype == np.float32
 
 
 def test_it_can_be_called_while_a_function_is_compiled():
@@ -98,6 +107,10 @@ SCALED = Camera(2 * np.eye(4), np.ones(2), np.zeros(2))
         ({"lr": {"albedo": ones(LR, 3)}}, "lr: unknown layer 'albedo'; expected color, depth"),
         ({"scale": 4}, "whole multiple of the LR size, 4 times"),
         ({"scale": 0}, "bad scale"),
+        (
+            {"depth": None, "motion": None, "rendered": False, "scale": 32},
+            "whole multiple of the LR size, 32 times; found 16x12 and 1x1",
+        ),
         (
             {"jitter": (0.8, 0.0)},
             r"bad jitter.*\[-0.5, 0.5\]; found \[0.8, 0.0\].*texture coordinates",

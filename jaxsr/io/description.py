@@ -27,6 +27,8 @@ READABLE = (1, 2)
 MAX_SIDE = 65536
 """Pixels of a side of the HR image at most."""
 MAX_INDEX = 2**31 - 1
+LEAST, MOST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+"""What float32, in which frames are computed, can hold of positive numbers."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,8 +311,9 @@ def _is_whole(x: Any) -> bool:
 
 
 def _is_positive(x: Any) -> bool:
+    """Whether x is a number above 0 that float32 can hold."""
     number = isinstance(x, int | float | np.integer | np.floating) and not isinstance(x, bool)
-    return number and bool(0 < x < math.inf)
+    return number and bool(LEAST <= x <= MOST)
 
 
 def _short(value: Any) -> str:

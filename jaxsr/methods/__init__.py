@@ -58,7 +58,13 @@ def build(name: str, settings: Mapping[str, Any], where: object = None) -> Metho
             f"no method {name!r} that learns", where=where, expected="one of " + ", ".join(LEARNED)
         )
     learned = LEARNED[name]
-    return learned.method(from_json(learned.options, settings, where), learned.loss())
+    options: Any = from_json(learned.options, settings, where)
+    try:
+        return learned.method(options, learned.loss())
+    except JaxsrError as e:
+        if where is None:
+            raise
+        raise JaxsrError(e.what, where=where, expected=e.expected, found=e.found, fix=e.fix) from e
 
 
 def variant(name: str, changes: Mapping[str, Any]) -> Method:

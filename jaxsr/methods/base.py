@@ -120,15 +120,33 @@ def step(method: Method) -> Step:
 
 
 def module_maker(new: Callable[[nnx.Rngs], nnx.Module]) -> Callable[[Net], Any]:
-    """`make(net)`: the module with these parameters, in evaluation mode. Its graph is built only once."""
+    """`make(net)`: the module with these parameters, in evaluation mode. Its graph is built only once.
+
+    `net` may lack random streams (of dropout), as that of a file of weights does: evaluation does not draw.
+    """
 
     @functools.cache
-    def graph() -> Any:
+    def graph() -> tuple[Any, Any]:
         module = nnx.eval_shape(lambda: new(nnx.Rngs(0)))
         module.eval()
-        return nnx.graphdef(module)
+        return nnx.graphdef(module), nnx.state(module, nnx.RngState)
 
-    return lambda net: nnx.merge(graph(), net)
+    def make(net: Net) -> Any:
+        graphdef, streams = graph()
+        if not jax.tree.leaves(streams):
+            return nnx.merge(graphdef, net)
+        return nnx.merge(
+            graphdef, jax.tree.map(_unused, streams), nnx.filter_state(net, nnx.Not(nnx.RngState))
+        )
+
+    return make
+
+
+def _unused(stream: Any) -> Array:
+    """Some value for a random stream, or its count, that nothing draws from."""
+    if jax.dtypes.issubdtype(stream.dtype, jax.dtypes.prng_key):
+        return jax.random.split(jax.random.key(0), stream.shape)
+    return jnp.zeros(stream.shape, stream.dtype)
 
 
 def last_frames(window: Window) -> tuple[Frame, Float[Array, "b H W 3"]]:

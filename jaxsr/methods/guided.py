@@ -28,6 +28,8 @@ from jaxsr.ops.reprojection import DEFAULT_SIGMA_GUIDE, DEFAULT_SIGMA_SPACE
 
 BUFFERS = frozenset({"hr.depth", "hr.motion", "hr.base_color", "hr.normal"})
 """What guided reprojection reads of both frames; depth says what is sky."""
+MAX_REACH, MAX_CANDIDATES = 256, 1024
+"""Bounds of the neighbourhood: a file of weights could else ask for work without end."""
 
 
 @dataclass(frozen=True)
@@ -55,6 +57,14 @@ class Options:
                 raise JaxsrError(f"bad {name}", where=name, expected="a number above 0", found=0)
         if not self.strides or min(self.strides) < 1:
             raise JaxsrError("bad strides", where="strides", expected="spacings from 1", found=self.strides)
+        reach, candidates = self.radius * max(self.strides), len(self.strides) * (2 * self.radius + 1) ** 2
+        if reach > MAX_REACH or candidates > MAX_CANDIDATES:
+            raise JaxsrError(
+                "the neighbourhood is too large",
+                where="strides, radius",
+                expected=f"at most {MAX_REACH} pixels and {MAX_CANDIDATES} candidates",
+                found=f"{reach} and {candidates}",
+            )
 
 
 def surface_of(gbuffer: GBuffer) -> tuple[Float[Array, "*b H W 3"], Float[Array, "*b H W 3"]]:

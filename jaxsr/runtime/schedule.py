@@ -31,13 +31,19 @@ def rendered_schedule(sequence: Sequence, every: int) -> list[bool]:
 
 
 def readers(sequence: Sequence, method: Method, scale: int, every: int = 1) -> list[Callable[[], Frame]]:
-    """One function per frame, which reads it as the method may see it: with the buffers that it needs."""
+    """One function per frame, which reads it as the method may see it: with the buffers that it needs.
+
+    The camera is None unless that of all frames is known, so that all frames have the same structure.
+    """
     schedule = rendered_schedule(sequence, every)
     needs = {rendered: method.needs.of(rendered, not all(schedule)) for rendered in (True, False)}
-    return [
-        functools.partial(sequence.frame, i, scale, rendered=rendered, needs=needs[rendered])
-        for i, rendered in enumerate(schedule)
-    ]
+    cameras = all(info.has_camera for info in sequence.infos)
+
+    def read(i: int, rendered: bool) -> Frame:
+        frame = sequence.frame(i, scale, rendered=rendered, needs=needs[rendered])
+        return frame if cameras else frame._replace(camera=None)
+
+    return [functools.partial(read, i, rendered) for i, rendered in enumerate(schedule)]
 
 
 def observed(sequence: Sequence, method: Method, scale: int, every: int = 1) -> Iterator[Frame]:

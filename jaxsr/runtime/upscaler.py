@@ -103,6 +103,8 @@ class Upscaler:
         frame = self._scaled(frame)
         needs = self.needs.of(rendered)
         lr, hr = frame.lr, frame.hr
+        if self.scale == 1:  # the images are the same
+            lr, hr = _filled(lr, hr), _filled(hr, lr)
         lacking = [name for name in DERIVED if f"hr.{name}" in needs and getattr(hr, FIELDS[name]) is None]
         if lacking and lr.depth_linear is not None and (lacking == ["depth"] or lr.motion_px is not None):
             depth, motion = _hr_from_lr(lr.depth_linear, lr.motion_px, frame.jitter_px, self.scale)
@@ -136,6 +138,12 @@ def _shapes(tree: Any) -> Any:
 
 
 _hr_from_lr = jax.jit(hr_from_lr, static_argnames=("scale",))
+
+
+def _filled(buffers: GBuffer, others: GBuffer) -> GBuffer:
+    """The buffers, and where they are None the others."""
+    lacking = [field for field in GBuffer._fields if getattr(buffers, field) is None]
+    return buffers._replace(**{field: getattr(others, field) for field in lacking})
 
 
 def _only(buffers: GBuffer, layers: frozenset[str]) -> GBuffer:

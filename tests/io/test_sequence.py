@@ -214,6 +214,7 @@ def test_a_file_lost_or_cut_after_opening(seq):
         (lambda h: h.update(fps=float("inf")), "bad JSON.*found Infinity"),
         (lambda h: h.update(exposure=None), "bad exposure; expected a number above 0; found null"),
         (lambda h: h.update(exposure=0.0), "bad exposure.*found 0.0"),
+        (lambda h: h.update(exposure=1e60), r"bad exposure.*found 1e\+60"),
         (lambda h: h.update(exposure=-1), "bad exposure.*found -1"),
         (lambda h: h.update(exposure=float("nan")), "bad JSON.*found NaN"),
         (lambda h: h.update(exposure=True), "bad exposure.*found true"),
@@ -238,6 +239,8 @@ def test_a_file_lost_or_cut_after_opening(seq):
         (lambda h: h["frames"][1].update(reset="false"), 'frame 2: bad reset.*true or false; found "false"'),
         (lambda h: h["frames"][1].update(cut=True), "found .reset. and .cut."),
         (lambda h: h["frames"][1].update(exposure=0), "frame 2: bad exposure.*above 0; found 0"),
+        (lambda h: h["frames"][1].update(exposure=1e60), r"frame 2: bad exposure.*found 1e\+60"),
+        (lambda h: h["frames"][1].update(exposure=1e-300), "frame 2: bad exposure.*found 1e-300"),
         (lambda h: h["frames"][1].update(exposure=True), "frame 2: bad exposure.*found true"),
         (
             lambda h: h["frames"][1]["camera"].update(world_from_view=np.diag([2, 2, 2, 1]).tolist()),

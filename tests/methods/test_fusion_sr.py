@@ -430,6 +430,21 @@ def test_settings_of_another_version_are_named():
         build("fusion-sr", settings, "a.b")
 
 
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"radius": 4096}, "36864 and 268500996"),
+        ({"strides": [4096]}, "4096 and 9"),
+        ({"eps": 0.0}, "found 0"),
+    ],
+)
+def test_settings_that_make_no_sense_name_the_file(change, words):
+    settings = json.loads(json.dumps(dict(METHODS["fusion-sr"].network.settings)))
+    settings["reprojection"] |= change
+    with pytest.raises(JaxsrError, match=rf"^a\.b: .*{words}"):
+        build("fusion-sr", settings, "a.b")
+
+
 def test_it_is_among_the_methods():
     assert METHODS["fusion-sr"].network.settings == method_of("default").network.settings
     assert METHODS["fusion-sr"].network.windows.length == 1

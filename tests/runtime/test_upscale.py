@@ -9,6 +9,7 @@ import pytest
 
 from jaxsr.errors import JaxsrError
 from jaxsr.io.images import read_color, read_png
+from jaxsr.io.sequence import Sequence
 from jaxsr.methods import METHODS
 from jaxsr.ops import to_display
 from jaxsr.runtime.load import find_method
@@ -37,6 +38,23 @@ def test_a_run_says_what_it_is_and_goes_on(sequence, tmp_path):
     (tmp_path / "out" / "exr" / "0002.exr").unlink()  # as if it had been interrupted
     upscale(sequence, find_method("nearest", 2), tmp_path / "out", scale=2)
     assert contents(tmp_path / "out") == before
+
+
+@pytest.mark.parametrize("every", [1, 2])
+def test_a_camera_that_only_some_frames_have_is_not_used(sequence, tmp_path, every):
+    images = []
+    for known in ((), (0, 2)):
+        folder = tmp_path / f"{len(known)}"
+        shutil.copytree(sequence.path, folder)
+        head = json.loads((folder / "sequence.json").read_text())
+        for k, frame in enumerate(head["frames"]):
+            if k not in known:
+                del frame["camera"]
+        (folder / "sequence.json").write_text(json.dumps(head))
+        out = tmp_path / f"out{len(known)}"
+        upscale(Sequence.open(folder), find_method("taau", 2), out, scale=2, every=every)
+        images.append([(out / "exr" / f"{n:04d}.exr").read_bytes() for n in (1, 2, 3)])
+    assert images[0] == images[1]
 
 
 def test_runs_do_not_mix(sequence, tmp_path):

@@ -98,6 +98,24 @@ def test_hr_depth_and_motion_come_from_lr_where_they_are_missing():
         states = first, second
 
 
+def test_at_scale_1_the_buffers_of_both_places_are_the_same():
+    up, frames = jaxsr.load("taau", scale=1), clip()
+    images = []
+    for place in ("lr", "hr"):
+        frame, other = (
+            jaxsr.Frame.of(
+                color=f.lr.base_color if f.rendered else None,
+                rendered=bool(f.rendered),
+                scale=1,
+                **{place: {"depth": f.lr.depth_linear, "motion": f.lr.motion_px}},
+            )
+            for f in frames[:2]
+        )
+        _, state = up(frame, up.init(frame))
+        images.append(up(other, state)[0])
+    np.testing.assert_array_equal(*images)
+
+
 class TestErrors:
     def line(self, match, call, *arguments, **options):
         with pytest.raises(jaxsr.JaxsrError, match=match) as caught:

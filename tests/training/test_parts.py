@@ -115,6 +115,17 @@ def test_frozen_parameters_make_no_difference_to_the_gradient_norm(data):
     np.testing.assert_allclose(measured["grad_norm"], expected, rtol=1e-5)
 
 
+def test_weights_without_random_streams_run():
+    """A file of weights has none, and a method's steps do not draw."""
+    net = nnx.state(two_parts.Net(nnx.Rngs(0)))
+    shown = jnp.linspace(0, 1, 24).reshape(1, 2, 4, 3)
+    made = [
+        two_parts.module(state).upscale(shown, 2)
+        for state in (net, nnx.filter_state(net, nnx.Not(nnx.RngState)))
+    ]
+    np.testing.assert_array_equal(*made)
+
+
 def test_all_frozen_is_refused():
     with pytest.raises(JaxsrError, match="all of the network of 'two' is frozen"):
         begin(two_parts.method(True), TrainConfig())
