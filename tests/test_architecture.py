@@ -6,7 +6,7 @@ from pathlib import Path
 import jaxsr
 
 PACKAGE = Path(jaxsr.__file__).parent
-GROUND = {"errors", "files", "progress", "provenance", "layers", "frames", "srgb"}
+GROUND = {"errors", "files", "progress", "provenance", "layers", "needs", "frames", "srgb"}
 """What everything above `ops` may import."""
 BELOW = {
     "errors": set(),
@@ -14,6 +14,7 @@ BELOW = {
     "progress": {"errors"},
     "provenance": {"errors", "files"},
     "layers": {"errors"},
+    "needs": set(),
     "srgb": set(),
     "ops": {"errors", "frames", "layers", "srgb"},
     # `Frame.of` is written in a file of its own: the two are one part.

@@ -20,7 +20,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, Frame, GBuffer, Scale, Window
 from jaxsr.io.sequence import Sequence as Clip
 from jaxsr.layers import FIELDS, channels, needed
-from jaxsr.methods.base import Needs, Windows
+from jaxsr.needs import Needs, Windows
 from jaxsr.progress import Progress, silent
 
 NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in ("color", *FIELDS))

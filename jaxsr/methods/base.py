@@ -11,6 +11,12 @@ from flax import nnx
 from jaxtyping import Array, Float
 
 from jaxsr.frames import Frame, Window
+from jaxsr.needs import Needs, Windows
+
+__all__ = [
+    "Loss", "Method", "Needs", "Net", "Network", "State", "Step", "Windows", "last_frames", "module_maker",
+    "one_image", "step",
+]  # fmt: skip
 
 State = Any
 """A pytree of arrays; its size does not depend on the length of the clip."""
@@ -18,54 +24,6 @@ Net = Any
 """A pytree of parameters (an `nnx.State`); None for methods that learn nothing."""
 Step = Callable[[Net, State, Frame], tuple[State, Float[Array, "H W 3"]]]
 Loss = Callable[[nnx.Module, Window], tuple[Float[Array, ""], dict[str, Float[Array, ""]]]]
-
-
-class Needs(NamedTuple):
-    """Buffers that a method reads, by place and layer, such as "lr.color" or "hr.normal"."""
-
-    rendered: frozenset[str]
-    """Of a rendered frame."""
-    extrapolated: frozenset[str] = frozenset()
-    """Of a frame that is to be extrapolated, and of the rendered frames before it."""
-
-    def of(self, rendered: bool, extrapolating: bool = True) -> frozenset[str]:
-        """What one frame must have.
-
-        Args:
-            rendered: whether this frame was rendered.
-            extrapolating: whether any frame of the clip is to be extrapolated.
-        """
-        if not rendered:
-            return self.extrapolated
-        return self.rendered | self.extrapolated if extrapolating else self.rendered
-
-
-class Windows(NamedTuple):
-    """The windows of consecutive frames that a network trains on."""
-
-    length: int = 1
-    """Frames per window."""
-    rendered: tuple[bool, ...] | None = None
-    """Which of them count as rendered; None means all. The colour of the others is hidden (zero)."""
-    made: tuple[int, ...] | None = (-1,)
-    """Positions of the frames that the loss compares with the truth; None means all."""
-    warmup: int = 0
-    """Frames at the start that only fill the history; evaluation does not measure them."""
-    multiple: int = 1
-    """LR sides of crops are multiples of this."""
-    lr_truth: bool = False
-    """Whether the loss wants the LR colour of the frames that are to be made."""
-
-    @property
-    def cadence(self) -> tuple[bool, ...]:
-        """`rendered`, written out."""
-        return (True,) * self.length if self.rendered is None else self.rendered
-
-    @property
-    def targets(self) -> tuple[int, ...]:
-        """`made` as positions from 0, in the order of time."""
-        made = range(self.length) if self.made is None else self.made
-        return tuple(sorted(i % self.length for i in made))
 
 
 class Network(NamedTuple):
