@@ -48,7 +48,7 @@ class WindowSource:
         cache, progress: as in `open_arrays`.
 
     Raises:
-        JaxsrError: no sequences; one that lacks the scale or a layer, or has too few frames without a cut;
+        JaxsrError: no sequences; one that lacks the scale or a layer, or has too few frames without a reset;
             unknown needs; windows that contradict themselves; what `open_arrays` raises.
     """
 
@@ -220,7 +220,7 @@ def _starts(clip: Clip, length: int, held_back: int) -> list[int]:
         raise JaxsrError(
             "fewer frames than a window has",
             where=clip.path,
-            expected=f"{length} consecutive frames without a cut"
+            expected=f"{length} consecutive frames without a reset"
             + (f" before the last {held_back}, which are held back" if held_back else ""),
             found=longest,
             fix="leave the sequence out, or render more frames",

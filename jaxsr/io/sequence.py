@@ -160,14 +160,6 @@ class Sequence:
         Raises:
             JaxsrError: the sequence, or this frame, has none.
         """
-        if scale == 1 and not self.hr:
-            raise JaxsrError(
-                "the sequence has no HR images",
-                where=self.path,
-                expected="HR colour: it is the truth",
-                found='"hr": false in sequence.json',
-                fix="use a sequence that has the truth, or run methods without measuring them",
-            )
         color = frozenset({"color"})
         return self._read(i, self._place(scale), color, color)["color"]
 
@@ -244,6 +236,14 @@ class Sequence:
         return self._resolution("hr" if scale == 1 else f"x{scale}")
 
     def _resolution(self, resolution: str) -> str:
+        if resolution == "hr" and not self.hr:
+            raise JaxsrError(
+                "the sequence has no HR images",
+                where=self.path,
+                expected=f"one of the scales {[s for s in self.scales if s > 1]}",
+                found='"hr": false in sequence.json',
+                fix="upscale from one of these; training and measuring need HR colour, which is the truth",
+            )
         if resolution not in self.resolutions:
             raise JaxsrError(
                 f"scale {1 if resolution == 'hr' else resolution.lstrip('x')} is not available",

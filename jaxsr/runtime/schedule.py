@@ -15,7 +15,7 @@ from jaxsr.methods import Method
 
 
 def rendered_schedule(sequence: Sequence, every: int) -> list[bool]:
-    """Which frames were rendered if only every n-th is, counted from each cut; the rest is extrapolated.
+    """Which frames were rendered if only every n-th is, counted from each reset; the rest is extrapolated.
 
     Raises:
         JaxsrError: `every` is below 1.

@@ -664,7 +664,7 @@ def test_what_cannot_be_derived_is_named(lr_only):
         lr_only.frame(0, 2, needs=needs("lr.color", "hr.depth", "hr.normal", "hr.base_color"))
     with pytest.raises(JaxsrError, match="the sequence has no HR images"):
         lr_only.truth(0)
-    with pytest.raises(JaxsrError, match=r"scale 1 is not available; expected one of \[2\]"):
+    with pytest.raises(JaxsrError, match=r"no HR images; expected one of the scales \[2\]"):
         lr_only.frame(0, 1)
     change_frame(lr_only, "x2/0002.exr", lambda c: c.pop("depth.Z"))
     with pytest.raises(JaxsrError, match=r"x2/0002\.exr: frame 2: missing layer 'depth'"):
