@@ -164,7 +164,7 @@ def _gbuffer(images: Images) -> GBuffer:
 def _jitter(jitter: Any, dtype: Any) -> Any:
     if not _known(jitter):
         return jitter
-    x = np.asarray(jitter, dtype)
+    x = _numbers(jitter, dtype)
     if x.shape != (2,) or not (np.abs(x) <= MAX_JITTER).all():
         raise JaxsrError(
             "bad jitter",
@@ -179,12 +179,20 @@ def _jitter(jitter: Any, dtype: Any) -> Any:
 def _exposure(exposure: Any, dtype: Any) -> Any:
     if not _known(exposure):
         return exposure
-    x = np.asarray(exposure, dtype)
+    x = _numbers(exposure, dtype)
     if x.shape != () or not (np.isfinite(x) and x > 0):
         raise JaxsrError(
-            "bad exposure", where="Frame.of, exposure", expected="a number above 0", found=x.tolist()
+            "bad exposure", where="Frame.of, exposure", expected="a number above 0", found=exposure
         )
     return x
+
+
+def _numbers(value: Any, dtype: Any) -> np.ndarray:
+    """The value as an array; an empty one, which no check lets through, if it is not made of numbers."""
+    try:
+        return np.asarray(value, dtype)
+    except (TypeError, ValueError):
+        return np.empty(0, dtype)
 
 
 def _flag(value: Any, name: str) -> Any:

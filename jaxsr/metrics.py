@@ -96,7 +96,7 @@ METRICS: dict[str, Metric] = {
         True,
         2,
         "PSNR, peak 1, of the frame difference (output t minus output t-1) against that of the truth: "
-        "flicker lowers it, a constant error does not. Not defined for the first frame or across a cut.",
+        "flicker lowers it, a constant error does not. Not defined for the first frame or across a reset.",
     ),
 }
 
@@ -280,7 +280,7 @@ def temporal_psnr(
     Args:
         images, truths: display-referred frames in order.
         mask: pixels that count, the same in all frames.
-        starts: True where a frame does not follow the one before it (a cut, a gap in the numbers).
+        starts: True where a frame does not follow the one before it (a reset, a gap in the numbers).
 
     Returns:
         One value per frame; None for frame 0 and for every start.

@@ -153,7 +153,7 @@ def read_display(path: Path, exposure: float) -> np.ndarray:
 
 
 def _starts(truth: Frames) -> list[bool]:
-    """True where a frame does not follow the one before it: a gap in the numbers, or a cut of a sequence.
+    """True where a frame does not follow the one before it: a gap in the numbers, or a reset of a sequence.
 
     A frame follows the one before it if its number is one more, or more by the most common step of the
     folder (the smallest of them, where several are as common).
@@ -165,8 +165,8 @@ def _starts(truth: Frames) -> list[bool]:
     usual = {1, int(values[np.argmax(counts)])} if len(steps) else {1}
     starts = [True, *(int(step) not in usual for step in steps)]
     if (truth.folder / "sequence.json").is_file():
-        cuts = {info.index for info in FrameSequence.open(truth.folder).infos if info.reset}
-        starts = [start or n in cuts for start, n in zip(starts, truth.numbers, strict=True)]
+        resets = {info.index for info in FrameSequence.open(truth.folder).infos if info.reset}
+        starts = [start or n in resets for start, n in zip(starts, truth.numbers, strict=True)]
     return starts
 
 

@@ -53,7 +53,11 @@ from jaxsr.ops.resampling import gather_pixels, kernel_taps, pixel_grid, upsampl
 
 @dataclass(frozen=True)
 class Accumulation:
-    """Constants of the accumulation over time, within 0.1 dB of the best that was found."""
+    """Constants of the accumulation over time.
+
+    `experiments/tune_classical.py` searches them. Those of light, and the tolerance of depth, were chosen on
+    one clip of each scene of the training set.
+    """
 
     sample_sigma: float = 0.4
     """How near to a pixel a sample must fall to count in full, in HR pixels."""

@@ -25,7 +25,7 @@ REGIONS = {
     f"the depth is off the straight line of its two neighbours by more than {BEND:.0%} of the largest of the "
     "three. Neither a slanted plane nor a texture, a shadow or a crease is one.",
     "disocclusions": "What was hidden in the frame before: holes of "
-    "jaxsr.ops.masks.disocclusion_mask between the two HR G-buffers. There are none at a cut or a start.",
+    "jaxsr.ops.masks.disocclusion_mask between the two HR G-buffers. There are none at a reset or a start.",
 }
 """Definitions of the regions that results are measured on (`jaxsr.evaluation.regions`), by name."""
 

@@ -87,6 +87,10 @@ class Upscaler:
 
     def _check_state(self, state: State, frame: Frame) -> None:
         """See that the state fits the frame: it was made for frames of this size with these buffers."""
+        if any(isinstance(x, jax.Array) and x.is_deleted() for x in jax.tree.leaves(state)):
+            raise JaxsrError(
+                "the state was used already", where=self.name, fix="use the state that the last call returned"
+            )
         key = jax.tree.structure(frame), tuple(map(jnp.shape, jax.tree.leaves(frame)))
         if key not in self._expected:
             self._expected[key] = _shapes(jax.eval_shape(self.method.init, frame))

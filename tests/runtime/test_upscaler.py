@@ -148,6 +148,14 @@ class TestErrors:
         small = analytic.frame(0, (24, 16), 2, (0.0, 0.0))[0]._replace(reset=np.asarray(False))
         self.line("the state does not fit the frame; expected a state for 24x16", up, small, state)
 
+    def test_of_a_state_that_was_used(self):
+        up, frames = loaded("taau"), clip(every=1)
+        state = up.init(frames[0])
+        _, after = up(frames[0], state)
+        jax.tree.map(lambda x: x.delete(), state)  # where a device does not do it by itself
+        self.line("taau: the state was used already; use the state that the last", up, frames[1], state)
+        up(frames[1], after)
+
     def test_an_extrapolation_without_the_history_that_it_wants(self):
         up, (first, second, *_) = loaded("guided"), clip()
         first = first._replace(hr=first.hr._replace(base_color=None, normal=None))
