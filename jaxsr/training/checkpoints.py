@@ -2,9 +2,9 @@
 
 Orbax writes each under a temporary name and renames it, so there is no half of one. Arrays are stored by name
 as the host sees them, whatever devices they lie on; what is not an array (position in the data, best result,
-seconds) is JSON beside them, with a hash over all arrays. `checkpoints.json` holds a hash of each
-file. Files are checked against it before Orbax reads them: on a damaged file Orbax goes on to read all others,
-and prints complaints until it has.
+seconds) is JSON beside them, with a hash over all arrays.
+`checkpoints.json` holds a hash of each file. Files are checked against it before Orbax reads them: on a
+damaged file Orbax goes on to read all others, and prints complaints until it has.
 """
 
 import contextlib
