@@ -17,6 +17,7 @@ from jaxsr.data.windows import WindowSource
 from jaxsr.errors import JaxsrError
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.layers import LAYERS
+from jaxsr.needs import Needs, Windows
 from tests.builders import make_sequence
 
 SMALL = {"size": (16, 8), "scales": (2,)}
@@ -178,7 +179,7 @@ def test_bad_pixels_stop_only_those_who_need_them(tmp_path, layer, value):
     assert list(arrays.broken) == [layer]
 
     def windows(*needs):
-        return WindowSource([seq.path], scale=1, needs=frozenset(needs), cache=tmp_path / "cache")
+        return WindowSource([seq.path], Needs(frozenset(needs)), Windows(), scale=1, cache=tmp_path / "cache")
 
     with pytest.raises(JaxsrError, match=rf"0003.exr: frame 3: layer '{layer}' .* x=2 y=1"):
         windows(f"lr.{layer}")
