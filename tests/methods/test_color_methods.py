@@ -17,6 +17,7 @@ from jaxsr.io.images import read_png
 from jaxsr.methods import LEARNED, METHODS, build, rcan, rrn, variant
 from jaxsr.methods.base import step
 from jaxsr.methods.color_only import ColorOptions, without_jitter
+from jaxsr.needs import Windows
 from jaxsr.ops import backward_warp, from_display, sample_jittered, to_display, upsample
 from jaxsr.runtime.load import find_method
 from jaxsr.training import TrainConfig, train
@@ -367,12 +368,12 @@ def test_gradients_are_finite_in_the_dark_and_in_the_sun(name, factor):
 
 
 def test_windows_leave_out_the_past(tmp_path):
-    """Only where the sequence has a cut does the window have one; none crosses one."""
+    """A window has a reset only where the sequence has one, and no window crosses one."""
     make_sequence(tmp_path / "clip", frames=5)
     needs, windows = method_of("rrn").needs, Windows(3, made=None)
     source = WindowSource([tmp_path / "clip"], needs, windows, scale=2, cache=tmp_path / "cache")
-    cuts = np.stack([stack([source[i]]).frames.reset[0] for i in range(len(source))])
-    np.testing.assert_array_equal(cuts, [[True, False, False], [False] * 3, [False] * 3])
+    resets = np.stack([stack([source[i]]).frames.reset[0] for i in range(len(source))])
+    np.testing.assert_array_equal(resets, [[True, False, False], [False] * 3, [False] * 3])
 
 
 # Options, files and the command line.
