@@ -94,7 +94,7 @@ def test_sizes_of_networks_in_a_header(tmp_path, method, arguments):
     path = tmp_path / "a.safetensors"
     weights(path, {"method": method, "arguments": arguments, "scale": 4})
     first, value = next(iter(arguments.items()))
-    with pytest.raises(JaxsrError, match=f"{first}: bad {first}; expected .*found {value}"):
+    with pytest.raises(JaxsrError, match=f"a.safetensors: bad {first}; expected .*found {value}"):
         find_method(str(path), 4)
 
 
