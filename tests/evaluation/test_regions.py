@@ -57,6 +57,16 @@ def test_disocclusions_are_what_was_hidden():
     assert not disocclusions(frame._replace(reset=np.asarray(True)), previous).any()
 
 
+@pytest.mark.parametrize("unknown", [(True, True), (False, True)])
+def test_disocclusions_without_a_camera(unknown):
+    frames = [analytic.frame(t, (160, 90), 1, (0.0, 0.0))[0] for t in (9, 8)]
+    frame, previous = (f._replace(camera=None) if u else f for f, u in zip(frames, unknown, strict=True))
+    hidden = analytic.render(9, (160, 90))["visible_before"][..., 0] == 0
+    found = disocclusions(frame, previous)
+    assert np.mean(found == hidden) > 0.99
+    assert np.mean(found[hidden]) > 0.65
+
+
 @pytest.mark.parametrize("scale", [1, 2])
 def test_regions_are_of_the_size_of_the_output_and_see_no_colour(scale):
     frame, previous = (analytic.frame(t, (64, 40), scale, (0.2, -0.3))[0] for t in (3, 2))
