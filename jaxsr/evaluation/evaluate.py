@@ -12,7 +12,7 @@ from typing import Any
 
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.compare import labels
-from jaxsr.evaluation.kept import run_kept
+from jaxsr.evaluation.kept import check_results, run_kept
 from jaxsr.evaluation.measuring import Reference
 from jaxsr.evaluation.running import Evaluation, Settings, run_methods
 from jaxsr.io.find import find_sequences
@@ -116,6 +116,8 @@ def evaluate(
     sequences = [part(FrameSequence.open(path), frames) for path in paths]
     for sequence in sequences:
         _check(sequence, loaded, settings)
+    for name, sequence in zip(names, sequences, strict=True):
+        check_results(sequence, settings, loaded, out / name)
     advance = progress("frames", 2 * len(loaded) * sum(map(len, sequences)))  # made, and measured
     compiled: dict[Any, float] = {}
     sections = [

@@ -10,24 +10,28 @@ Only files that `run.json` names are ever replaced or deleted (`runtime/record.p
 import importlib.resources
 import json
 import math
+import os
 import platform
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+import jax
 
 import jaxsr
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.code import UnknownCodeError, method_digest
-from jaxsr.evaluation.running import Evaluation, run_method
+from jaxsr.evaluation.running import Evaluation, Settings, run_method
 from jaxsr.files import atomic_path, digest, file_digest, read_json, write_text
+from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.metrics import available
 from jaxsr.provenance import device, machine, versions
 from jaxsr.report.results import MethodResult
 from jaxsr.report.tables import json_value
 from jaxsr.runtime.cost import Cost, Timing
 from jaxsr.runtime.load import LoadedMethod
-from jaxsr.runtime.record import claim_folder, describe_run, frame_path, read_run
+from jaxsr.runtime.record import check_folder, claim_folder, describe_run, frame_path, read_run
 
 RECORD = "result.json"
 FORMAT = "jaxsr-result"
@@ -68,6 +72,21 @@ def run_kept(evaluation: Evaluation, loaded: LoadedMethod, out: Path) -> MethodR
     return result
 
 
+def check_results(
+    sequence: FrameSequence, settings: Settings, methods: Sequence[LoadedMethod], out: Path
+) -> None:
+    """See that all results of a sequence can be written into `out`; changes nothing.
+
+    Raises:
+        JaxsrError: a folder has files that jaxsr did not write.
+    """
+    names = [("truth", None), ("input", None), *((one.method.name, one.weights) for one in methods)]
+    for name, weights in names:
+        _check_record(out / name / RECORD)
+        run = describe_run(sequence, settings.scale, settings.every, name, weights)
+        check_folder(out / name, run, replace=True)
+
+
 def _key(evaluation: Evaluation, loaded: LoadedMethod) -> dict[str, Any] | None:
     """All that a result depends on; None if that cannot be told."""
     sequence, settings = evaluation.sequence, evaluation.settings
@@ -90,6 +109,8 @@ def _key(evaluation: Evaluation, loaded: LoadedMethod) -> dict[str, Any] | None:
         "packages": versions(),
         "device": device(),
         "cpu": machine(),
+        "x64": bool(jax.config.read("jax_enable_x64")),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
         "code": digest(file.read_bytes() for file in code),
         "method": loaded.method.name,
         "method_code": method,

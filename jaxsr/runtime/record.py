@@ -70,6 +70,25 @@ def claim_folder(
         JaxsrError: frames of another run, files that jaxsr did not write here, or a path that is no folder.
             Nothing is changed then.
     """
+    before = check_folder(out, run, replace=replace)
+    if before is not None and _difference(before, run):
+        for file in _files(out, before):
+            file.unlink(missing_ok=True)
+        before = None
+    kinds = sorted({*kinds, *(before or {}).get("kinds", ())})
+    record = {"format": FORMAT, "version": VERSION, **run, "kinds": kinds, "made": provenance()}
+    write_text(out / RECORD, json.dumps(record, indent=1) + "\n")
+
+
+def check_folder(out: Path, run: Mapping[str, Any], *, replace: bool = False) -> dict[str, Any] | None:
+    """See that `claim_folder` would let the run write there; changes nothing.
+
+    Returns:
+        The record of the folder, if it has one.
+
+    Raises:
+        JaxsrError: as `claim_folder`.
+    """
     for place in (out, *out.parents):
         if place.exists() and not place.is_dir():
             raise JaxsrError("not a folder", where=place, fix=_FIX)
@@ -83,15 +102,9 @@ def claim_folder(
                 raise JaxsrError(
                     f"holds {file.name}, which no {RECORD} of jaxsr names", where=out / kind, fix=_FIX
                 )
-    if before is not None and (difference := _difference(before, run)):
-        if not replace:
-            raise JaxsrError("the folder holds frames of another run", where=out, **difference, fix=_FIX)
-        for file in ours:
-            file.unlink(missing_ok=True)
-        before = None
-    kinds = sorted({*kinds, *(before or {}).get("kinds", ())})
-    record = {"format": FORMAT, "version": VERSION, **run, "kinds": kinds, "made": provenance()}
-    write_text(out / RECORD, json.dumps(record, indent=1) + "\n")
+    if before is not None and not replace and (difference := _difference(before, run)):
+        raise JaxsrError("the folder holds frames of another run", where=out, **difference, fix=_FIX)
+    return before
 
 
 def read_run(out: Path) -> dict[str, Any] | None:

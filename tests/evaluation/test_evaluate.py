@@ -18,6 +18,7 @@ import pytest
 
 from jaxsr import metrics
 from jaxsr.errors import JaxsrError
+from jaxsr.evaluation import kept
 from jaxsr.evaluation.code import method_digest
 from jaxsr.evaluation.evaluate import evaluate, find_methods, part
 from jaxsr.evaluation.measuring import Reference, metrics_with
@@ -404,12 +405,25 @@ def test_files_of_others_are_not_touched(data, tmp_path, record):
     before = files_of(folder)
     with pytest.raises(JaxsrError, match=r"result.json: not a result of jaxsr"):
         run([data / "set" / "one"], ["nearest"], tmp_path / "out")
-    assert files_of(folder) == before
+    assert files_of(tmp_path / "out") == before  # nor is anything written beside them
     (folder / "result.json").unlink()
     before = files_of(folder)
     with pytest.raises(JaxsrError, match=r"exr: holds 9999.exr"):
         run([data / "set" / "one"], ["nearest"], tmp_path / "out")
-    assert files_of(folder) == before
+    assert files_of(tmp_path / "out") == before
+
+
+def test_precision_and_flags_of_the_compiler_are_in_the_key(data, monkeypatch):
+    sequence = upscale.FrameSequence.open(data / "set" / "two")
+    evaluation = Evaluation(sequence, SETTINGS, Reference(sequence))
+    loaded = find_method("nearest", 2)
+    key = kept._key(evaluation, loaded)
+    assert kept._key(evaluation, loaded) == key
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=true")
+    assert kept._key(evaluation, loaded) != key
+    monkeypatch.undo()
+    with jax.enable_x64(not jax.config.jax_enable_x64):
+        assert kept._key(evaluation, loaded) != key
 
 
 def test_what_was_added_beside_results_is_not_deleted(data, tmp_path):
