@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame
 from jaxsr.io.exr import write_exr
 from jaxsr.io.images import write_png
@@ -87,12 +88,30 @@ def write_frames(
     """Make all frames of a sequence; each is on disk when it is given."""
     frames = stream(loaded.method, frames_in_memory(sequence, loaded.method, scale, every), loaded.net)
     for i, (info, made) in enumerate(zip(sequence.infos, frames, strict=True)):
+        _check_image(made.image, f"{loaded.method.name}, {sequence.path}, frame {info.index}")
         half = np.clip(made.image, 0, np.finfo(np.float16).max).astype(np.float16)
         channels = {f"color.{c}": half[..., k] for k, c in enumerate("RGB")}
         write_exr(frame_path(out, "exr", info.index), channels)
         image = display(made.image, sequence.exposure_at(i))
         write_png(frame_path(out, "png", info.index), image)
         yield MadeFrame(image, made.seconds, made.compile_seconds, made.cost)
+
+
+def _check_image(image: np.ndarray, where: str) -> None:
+    """See that a frame that was made is finite, before it is written.
+
+    Raises:
+        JaxsrError: it is not; says how much of it.
+    """
+    bad = ~np.isfinite(image).all(-1)
+    if bad.any():
+        raise JaxsrError(
+            "the method made NaN or Inf, and the frame is not written",
+            where=where,
+            expected="finite colour",
+            found=f"{bad.mean():.2%} of the pixels" if bad.mean() >= 1e-4 else f"{int(bad.sum())} pixels",
+            fix="run jaxsr inspect on the sequence; very bright input and damaged weights cause this",
+        )
 
 
 def upscale(
@@ -118,8 +137,9 @@ def upscale(
         The time of a frame.
 
     Raises:
-        JaxsrError: what the method needs is not there, a frame cannot be read (those before it stay), or the
-            folder holds frames of another run or files that jaxsr did not write (`claim_folder`).
+        JaxsrError: what the method needs is not there, a frame cannot be read, or comes out as NaN or Inf
+            (the frames before it stay), or the folder holds frames of another run or files that jaxsr did
+            not write (`claim_folder`).
     """
     rendered_schedule(sequence, every)
     check_needs(loaded.method, sequence, scale, every)

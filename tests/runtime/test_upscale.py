@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -55,6 +56,25 @@ def test_a_camera_that_only_some_frames_have_is_not_used(sequence, tmp_path, eve
         upscale(Sequence.open(folder), find_method("taau", 2), out, scale=2, every=every)
         images.append([(out / "exr" / f"{n:04d}.exr").read_bytes() for n in (1, 2, 3)])
     assert images[0] == images[1]
+
+
+@pytest.mark.parametrize(("value", "pixels", "share"), [(np.nan, 1, "0.13%"), (np.inf, 768, "100.00%")])
+def test_pixels_that_are_not_finite_are_not_written(sequence, tmp_path, value, pixels, share):
+    nearest = find_method("nearest", 2)
+
+    def bad(net, state, frame):
+        state, image = nearest.method.upscale(net, state, frame)
+        hit = (jnp.arange(768) < pixels).reshape(24, 32, 1) & (frame.jitter_px[0] == second)
+        return state, jnp.where(hit, value, image)
+
+    second = float(sequence.infos[1].jitter_px[0])
+    loaded = nearest._replace(method=nearest.method._replace(upscale=bad))
+    words = f"frame 2: the method made NaN or Inf.*found {share} of the pixels.*jaxsr inspect"
+    with pytest.raises(JaxsrError, match=words) as error:
+        upscale(sequence, loaded, tmp_path / "out", scale=2)
+    assert "\n" not in str(error.value)
+    for kind in ("exr", "png"):
+        assert [p.stem for p in (tmp_path / "out" / kind).iterdir()] == ["0001"]
 
 
 def test_runs_do_not_mix(sequence, tmp_path):
