@@ -57,19 +57,24 @@ def same_hashes(old: str | None, new: str | None) -> bool:
     )
 
 
-def initial_weights(method: Method, init: Iterable[str]) -> tuple[Net | None, list[str]]:
+def initial_weights(
+    method: Method, init: Iterable[str], scale: int | None = None
+) -> tuple[Net | None, list[str]]:
     """State of the network to start from, of any scale; later files replace what earlier ones gave.
 
     Args:
         method: with a network.
         init: texts as `parse` takes them.
+        scale: of the training, which the files of parts must have too; None does not compare it. A whole
+            network may start from weights of another scale.
 
     Returns:
         What the files give of the network's state (None without files), and notes for the user: settings
         that are different from those that the weights were made with.
 
     Raises:
-        JaxsrError: no such part or file, weights of another method, or arrays that do not fit.
+        JaxsrError: no such part or file, weights of another method, arrays that do not fit, or a part
+            of another scale or other settings.
     """
     assert method.network is not None
     new = method.network.new
@@ -82,6 +87,8 @@ def initial_weights(method: Method, init: Iterable[str]) -> tuple[Net | None, li
         arrays, header = load_weights(source.file)
         if not source.part:
             notes += _changed_settings(method, header, source.file)
+        else:
+            _check_part(method, header, source, scale)
         filled = into(nnx.from_flat_state(list(part.items())), _of_part(arrays, part, source), source.file)
         flat |= {(*place, *path): variable for path, variable in nnx.to_flat_state(filled)}
     return nnx.from_flat_state(list(flat.items())) if flat else None, notes
@@ -123,5 +130,31 @@ def _changed_settings(method: Method, header: Mapping[str, Any], file: Path) -> 
             "weights of another method", where=file, expected=method.name, found=header.get("method")
         )
     old, new = settings_of(dict(header), file), method.network.settings
-    changed = [f"{name} {old[name]} -> {new[name]}" for name in new if name in old and old[name] != new[name]]
+    changed = [f"{name} {old[name]} -> {new[name]}" for name in _different(old, new)]
     return [f"{file.name} was made with other options: {', '.join(changed)}"] if changed else []
+
+
+def _different(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
+    """Names of the settings that both have, with other values."""
+    return [name for name in new if name in old and old[name] != new[name]]
+
+
+def _check_part(method: Method, header: Mapping[str, Any], source: Source, scale: int | None) -> None:
+    """See that a part was made for this training: it may be frozen, and would then never adapt.
+
+    Raises:
+        JaxsrError: it has another scale or other settings; names both values.
+    """
+    assert method.network is not None
+    old: dict[str, Any] = settings_of(dict(header), source.file)
+    new: dict[str, Any] = dict(method.network.settings)
+    if scale is not None and "scale" in header:
+        old, new = old | {"scale": header["scale"]}, new | {"scale": scale}
+    if changed := _different(old, new):
+        raise JaxsrError(
+            f"the weights for part {source.part!r} were made with other settings",
+            where=source.file,
+            expected=", ".join(f"{name} {new[name]}" for name in changed),
+            found=", ".join(f"{name} {old[name]}" for name in changed),
+            fix="train with the settings of the file, or choose another file",
+        )

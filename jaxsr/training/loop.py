@@ -62,7 +62,7 @@ def train(
     weights: Net = None
     notes: list[str] = []
     if not has_checkpoints(config.out):
-        weights, notes = initial_weights(method, config.init)
+        weights, notes = initial_weights(method, config.init, config.scale)
     loader, evaluate = open_data(method, config, quiet=quiet)
     record = describe(method, config, loader.sequences, evaluate.sequences)
     notes += enter(config.out, record)

@@ -235,6 +235,20 @@ def test_bad_parts_are_named(trained, part_file):
             initial_weights(method, (text,))
 
 
+def test_a_part_of_another_scale_or_other_settings_is_refused(part_file):
+    method = two_parts.method()
+    settings = {"width": 8, "eps": 0.1}
+    method = method._replace(network=method.network._replace(settings=settings))
+    init = (f"upscaler={part_file}",)
+    assert initial_weights(method, init, 2)[0] is not None
+    with pytest.raises(JaxsrError, match=r"part 'upscaler' .*expected scale 4; found scale 2"):
+        initial_weights(method, init, 4)
+    arrays, _ = load_weights(part_file)
+    save_weights(part_file, arrays, new_header("other", {"width": 16, "depth": 3, "eps": 0.1}, 2))
+    with pytest.raises(JaxsrError, match=r"safetensors: .*expected width 8; found width 16"):
+        initial_weights(method, init, 2)
+
+
 def test_files_and_parts(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "lr=3.safetensors").touch()
