@@ -23,6 +23,7 @@ import numpy as np
 from jaxsr.blender.convert import Instances, camera_from_json, convert_color, convert_gbuffer
 from jaxsr.blender.process import BlenderProcess, find_blender
 from jaxsr.errors import JaxsrError
+from jaxsr.files import read_json
 from jaxsr.io.exr import read_exr
 from jaxsr.io.writing import FrameInfo, SequenceWriter
 
@@ -215,7 +216,7 @@ def _take_over(
     writer: SequenceWriter,
 ) -> None:
     """Converts and writes one finished frame, then deletes its raw files."""
-    info = json.loads((raw / f"{frame:04d}.json").read_text())
+    info = read_json(raw / f"{frame:04d}.json", dict)
     camera, previous = camera_from_json(info["camera"]), camera_from_json(info["previous"])
     instances = Instances(described["objects"], described["instanced"], described["instances"])
     jitter = (float(info["jitter_px"][0]), float(info["jitter_px"][1]))

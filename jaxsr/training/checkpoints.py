@@ -23,7 +23,7 @@ import numpy as np
 from orbax.checkpoint import v1 as ocp
 
 from jaxsr.errors import JaxsrError
-from jaxsr.files import atomic_path
+from jaxsr.files import atomic_path, read_json
 from jaxsr.training.state import TrainState
 
 KEEP = 3
@@ -120,8 +120,12 @@ class Checkpoints:
             raise self._damaged(step, f"another file than was written: {changed[0]}")
         try:
             with _silent():
-                found = self._orbax.metadata(step).custom_metadata or {}
+                metadata = self._orbax.metadata(step)
+                found = metadata.custom_metadata or {}
+                self._check_layout(step, metadata.metadata, wanted)
                 arrays = self._orbax.load(step, {k: np.empty(a.shape, a.dtype) for k, a in wanted.items()})
+        except JaxsrError:
+            raise
         except Exception as e:
             raise self._damaged(step, _line(e)) from e
         run = found.get("run")
@@ -131,13 +135,32 @@ class Checkpoints:
 
     def _read_hashes(self) -> dict[str, dict[str, str]]:
         try:
-            return json.loads(self._hashes.read_text(encoding="utf-8"))
-        except (OSError, ValueError):  # a second opinion, and no more
+            read = read_json(self._hashes, dict)
+        except JaxsrError:  # a second opinion, and no more
             return {}
+        return {step: files for step, files in read.items() if isinstance(files, dict)}
 
     def _write_hashes(self, hashes: dict[str, dict[str, str]]) -> None:
         with atomic_path(self._hashes) as temporary:
             temporary.write_text(json.dumps(hashes, indent=1), encoding="utf-8")
+
+    def _check_layout(self, step: int | None, stored: Any, wanted: dict[str, np.ndarray]) -> None:
+        """See that a whole checkpoint has the arrays of this version's state.
+
+        Raises:
+            JaxsrError: it has others, as those of earlier versions of jaxsr have.
+        """
+        if not isinstance(stored, dict) or stored.keys() == wanted.keys():
+            return
+        lacking, more = sorted(wanted.keys() - stored.keys()), sorted(stored.keys() - wanted.keys())
+        raise JaxsrError(
+            "the checkpoint is of another version of jaxsr, whose training state had other parts",
+            where=self.folder / str(step),
+            expected=lacking[0] if lacking else "no other parts",
+            found=more[0] if more else "no such part",
+            fix="resume with the version that wrote it, or start anew in another --out, "
+            "with --init and the weights that lie beside the checkpoints",
+        )
 
     def _damaged(self, step: int | None, found: str) -> JaxsrError:
         return JaxsrError(

@@ -24,7 +24,7 @@ from jaxsr.io.images import read_png
 from jaxsr.methods import Network, fusion_sr, variant
 from jaxsr.methods.image_loss import ImageLoss
 from jaxsr.progress import Bar
-from jaxsr.training import TrainConfig, command
+from jaxsr.training import TrainConfig, checkpoints, command
 from jaxsr.training import train as train_method
 from jaxsr.training.checkpoints import Checkpoints
 from jaxsr.training.data import open_data
@@ -419,6 +419,14 @@ class TestErrors:
         out = copied(whole, tmp_path)
         (out / "log.csv").write_text("a,b\nc,d\n")
         with pytest.raises(JaxsrError, match=r"log.csv: not the log"):
+            tiny_method.train(data, out)
+
+    def test_checkpoint_of_another_version(self, whole, data, tmp_path, monkeypatch):
+        out = copied(whole, tmp_path)
+        named = checkpoints._named
+        monkeypatch.setattr(checkpoints, "_named", lambda state: [(f"new.{n}", x) for n, x in named(state)])
+        words = r"checkpoints/12: the checkpoint is of another version of jaxsr.*with --init"
+        with pytest.raises(JaxsrError, match=words):
             tiny_method.train(data, out)
 
     @pytest.mark.parametrize("damage", ["gone", "metadata", "truncated", "bits"])
