@@ -13,7 +13,7 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import FIELDS, LAYERS, Camera, Frame, GBuffer, Scale
-from jaxsr.layers import MAX_JITTER, RIGID_TOLERANCE
+from jaxsr.layers import MAX_JITTER, is_rigid
 
 Images = Mapping[str, Any]
 
@@ -216,15 +216,12 @@ def _camera(camera: Camera, dtype: Any) -> Camera:
             )
         values[name] = x
     matrix = values["world_from_view"]
-    if _known(matrix):
-        rotation = matrix[:3, :3]
-        off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max())
-        if not off <= RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
-            raise JaxsrError(
-                "the camera is not rigid",
-                where="Frame.of, camera world_from_view",
-                expected="a rotation and a translation, without scale or mirror image; last row 0 0 0 1",
-                found=matrix.tolist(),
-                fix="take the scale out of the matrix",
-            )
+    if _known(matrix) and not is_rigid(matrix.tolist()):
+        raise JaxsrError(
+            "the camera is not rigid",
+            where="Frame.of, camera world_from_view",
+            expected="a rotation and a translation, without scale or mirror image; last row 0 0 0 1",
+            found=matrix.tolist(),
+            fix="take the scale out of the matrix",
+        )
     return Camera(**values)  # type: ignore[arg-type]

@@ -13,6 +13,9 @@ MAX_JITTER = 0.5 + 1e-4
 RIGID_TOLERANCE = 1e-3
 """How far the entries of R'R may be from those of the identity, R the rotation of a camera."""
 
+DERIVED = frozenset({"depth", "motion"})
+"""HR layers that are made from the LR ones where there are none (`jaxsr.ops.hr_from_lr`)."""
+
 
 class Layer(NamedTuple):
     """One row: a buffer of an image, or its colour."""
@@ -63,3 +66,15 @@ def channels(name: str) -> tuple[str, ...]:
 def needed(places: frozenset[str], place: str) -> frozenset[str]:
     """The layers that a set of needs such as `{"lr.color", "hr.motion"}` names for "lr" or "hr"."""
     return frozenset(need.partition(".")[2] for need in places if need.startswith(f"{place}."))
+
+
+def is_rigid(matrix: list[list[float]]) -> bool:
+    """Whether a 4 x 4 matrix is a rotation and a translation, but for `RIGID_TOLERANCE`; NaN is not."""
+    x, y, z = columns = [[row[k] for row in matrix[:3]] for k in range(3)]
+    products = [(sum(map(float.__mul__, a, b)), a is b) for a in columns for b in columns]
+    right_handed = sum(z[k] * (x[k - 2] * y[k - 1] - x[k - 1] * y[k - 2]) for k in range(3))
+    return (
+        all(abs(product - same) <= RIGID_TOLERANCE for product, same in products)
+        and all(abs(v - w) <= RIGID_TOLERANCE for v, w in zip(matrix[3], (0, 0, 0, 1), strict=True))
+        and right_handed > 0
+    )

@@ -33,9 +33,9 @@ from jaxsr.inspection.verdicts import (
 )
 from jaxsr.io.description import check_info
 from jaxsr.io.exr import read_exr
-from jaxsr.io.sequence import DERIVED, Sequence
+from jaxsr.io.sequence import Sequence
 from jaxsr.io.writing import frame_file
-from jaxsr.layers import LAYERS, channels
+from jaxsr.layers import DERIVED, LAYERS, channels
 
 
 @dataclass

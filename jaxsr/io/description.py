@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.layers import LAYERS, MAX_JITTER, RIGID_TOLERANCE
+from jaxsr.layers import LAYERS, MAX_JITTER, is_rigid
 
 if TYPE_CHECKING:
     from jaxsr.frames import Camera
@@ -243,9 +243,7 @@ def _check_camera(info: FrameInfo, name: str, where: object, conventions: bool) 
         )
     if not conventions:
         return
-    rotation = matrix[:3, :3]
-    off = max(np.abs(rotation.T @ rotation - np.eye(3)).max(), np.abs(matrix[3] - (0, 0, 0, 1)).max())
-    if off > RIGID_TOLERANCE or np.linalg.det(rotation) < 0:
+    if not is_rigid(matrix.tolist()):
         raise JaxsrError(
             f"{name}: world_from_view is not rigid",
             where=where,

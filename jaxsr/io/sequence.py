@@ -22,18 +22,16 @@ from jaxsr.frames import Frame, GBuffer, Scale
 from jaxsr.io.description import check_head, check_order, check_pixels, frame_info, has_hr
 from jaxsr.io.exr import read_exr, read_exr_header
 from jaxsr.io.writing import FrameInfo, SequenceWriter, frame_file
-from jaxsr.layers import FIELDS, LAYERS, channels, needed
+from jaxsr.layers import DERIVED, FIELDS, LAYERS, channels, needed
 from jaxsr.ops.motion import hr_from_lr_on_host
 from jaxsr.ops.pinhole import world_from_depth
 
-__all__ = ["DERIVED", "NEEDS", "FrameInfo", "Sequence", "SequenceWriter", "prefetch"]
+__all__ = ["NEEDS", "FrameInfo", "Sequence", "SequenceWriter", "prefetch"]
 
 T = TypeVar("T")
 
 NEEDS = frozenset(f"{place}.{layer}" for place in ("lr", "hr") for layer in FIELDS) | {"lr.color"}
 """All that a method can need: "lr.color", "hr.depth", ... The truth, "hr.color", is not among it."""
-DERIVED = frozenset({"depth", "motion"})
-"""HR layers that are derived from the LR ones where the files have none."""
 
 
 class Sequence:

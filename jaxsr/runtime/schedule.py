@@ -10,7 +10,8 @@ import numpy as np
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame
-from jaxsr.io.sequence import DERIVED, Sequence, prefetch
+from jaxsr.io.sequence import Sequence, prefetch
+from jaxsr.layers import DERIVED
 from jaxsr.methods import Method
 
 

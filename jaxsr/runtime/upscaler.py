@@ -8,13 +8,10 @@ from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import FIELDS, Frame, GBuffer, Scale
-from jaxsr.layers import needed
+from jaxsr.layers import DERIVED, needed
 from jaxsr.methods.base import Needs, State
 from jaxsr.ops import hr_from_lr
 from jaxsr.runtime.load import LoadedMethod, find_method
-
-DERIVED = ("depth", "motion")
-"""HR buffers that are made from the LR ones where a frame lacks them (`jaxsr.ops.hr_from_lr`)."""
 
 
 class Upscaler:
@@ -109,7 +106,9 @@ class Upscaler:
         lr, hr = frame.lr, frame.hr
         if self.scale == 1:  # the images are the same
             lr, hr = _filled(lr, hr), _filled(hr, lr)
-        lacking = [name for name in DERIVED if f"hr.{name}" in needs and getattr(hr, FIELDS[name]) is None]
+        lacking = [
+            name for name in sorted(DERIVED) if f"hr.{name}" in needs and getattr(hr, FIELDS[name]) is None
+        ]
         if lacking and lr.depth_linear is not None and (lacking == ["depth"] or lr.motion_px is not None):
             depth, motion = _hr_from_lr(lr.depth_linear, lr.motion_px, frame.jitter_px, self.scale)
             made = {"depth": depth, "motion": motion}
