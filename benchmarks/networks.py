@@ -284,7 +284,9 @@ def window_of(inputs: Inputs) -> Window:
     zero = np.zeros((BATCH, 2), np.float32)
     flags = np.ones(BATCH, bool)
     camera = Camera(np.broadcast_to(np.eye(4, dtype=np.float32), (BATCH, 4, 4)), zero + 1, zero)
-    frame = Frame(color, buffers(color), buffers(truth), zero, camera, flags, flags, zero[:, 0] + 1, Scale(4))
+    frame = Frame(
+        color, buffers(color), buffers(truth), zero, camera, flags, flags, zero[:, 0] + 1, zero, Scale(4)
+    )
     return jax.tree.map(lambda x: np.asarray(x)[:, None], Window(frame, truth))
 
 

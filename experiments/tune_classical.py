@@ -38,7 +38,7 @@ from jaxsr.evaluation.demo import description
 from jaxsr.files import atomic_path
 from jaxsr.frames import Frame
 from jaxsr.io.sequence import Sequence as FrameSequence
-from jaxsr.methods import METHODS, Method, guided, guided_taau, taau
+from jaxsr.methods import METHODS, Method, accumulation, guided, guided_taau, taau
 from jaxsr.methods.base import step as step_of
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
 
@@ -189,7 +189,7 @@ def tune_taau(sequences: Sequence[FrameSequence], rounds: int) -> dict[str, Any]
         rounds,
         "guided-taau",
     )
-    start = replace(start, temporal=taau.Accumulation(**temporal["options"]))
+    start = replace(start, temporal=accumulation.Accumulation(**temporal["options"]))
     guide = coordinate_search(
         start.upsampling,
         GUIDED_GRID,

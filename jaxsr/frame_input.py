@@ -23,6 +23,7 @@ def make_frame(
     hr: Images,
     *,
     jitter: Any,
+    hr_jitter: Any,
     exposure: Any,
     camera: Camera | None,
     reset: Any,
@@ -53,6 +54,7 @@ def make_frame(
         lr=_gbuffer(low),
         hr=_gbuffer(high),
         jitter_px=_jitter(jitter, dtype),
+        hr_jitter_px=_hr_jitter(hr_jitter, factor, dtype),
         camera=None if camera is None else _camera(camera, dtype),
         reset=_flag(reset, "reset"),
         rendered=_flag(rendered, "rendered"),
@@ -172,6 +174,21 @@ def _jitter(jitter: Any, dtype: Any) -> Any:
             expected="(x, y) in LR pixels, each in [-0.5, 0.5]",
             found=np.asarray(jitter).tolist(),
             fix="convert it: texture coordinates times the LR size, NDC times half of it",
+        )
+    return x
+
+
+def _hr_jitter(jitter: Any, scale: int, dtype: Any) -> Any:
+    if not _known(jitter):
+        return jitter
+    x, most = _numbers(jitter, dtype), MAX_JITTER * max(scale, 1)
+    if x.shape != (2,) or not (np.abs(x) <= most).all():
+        raise JaxsrError(
+            "bad hr_jitter",
+            where="Frame.of, hr_jitter",
+            expected=f"(x, y) in HR pixels, each in [-{most:g}, {most:g}], half an LR pixel",
+            found=np.asarray(jitter).tolist(),
+            fix="convert it: texture coordinates times the HR size, NDC times half of it",
         )
     return x
 

@@ -82,7 +82,7 @@ class Frame(NamedTuple):
     lr: GBuffer
     """Jittered, at the size of `color_linear`."""
     hr: GBuffer
-    """Unjittered, at the size of the output."""
+    """At the size of the output; jittered by `hr_jitter_px`, which is most often 0."""
     jitter_px: Float[Array, "*b 2"]
     """J of this frame, in LR pixels."""
     camera: Camera | None
@@ -93,6 +93,8 @@ class Frame(NamedTuple):
     """False where the frame was never shaded."""
     exposure: Float[Array, "*b"]
     """Factor on linear colour before the display tone map."""
+    hr_jitter_px: Float[Array, "*b 2"]
+    """J of the HR buffers, in HR pixels: 0 where they are not jittered. Output and truth never are."""
     factor: Scale = Scale(1)
     """HR size divided by LR size, for the pytree; `scale` is the plain number."""
 
@@ -104,6 +106,7 @@ class Frame(NamedTuple):
         depth: Any = None,
         motion: Any = None,
         jitter: Any = (0.0, 0.0),
+        hr_jitter: Any = (0.0, 0.0),
         reset: Any = False,
         exposure: Any = 1.0,
         lr: Mapping[str, Any] | None = None,
@@ -119,6 +122,8 @@ class Frame(NamedTuple):
             depth: LR linear view depth `[h, w, 1]` or `[h, w]`, +inf for sky.
             motion: LR backward motion `[h, w, 2]` in LR pixels, without jitter.
             jitter: J (x, y) in LR pixels, each in [-0.5, 0.5].
+            hr_jitter: J (x, y) of the HR buffers in HR pixels, each at most half an LR pixel. HR buffers that
+                were rendered with the projection of the LR frame have the scale times `jitter`.
             reset: True where this frame does not continue the one before it.
             exposure: factor on linear colour before the display tone map, above 0.
             lr: further LR layers by name, such as `{"base_color": ..., "normal": ...}`.
@@ -137,6 +142,7 @@ class Frame(NamedTuple):
             {k: v for k, v in low.items() if v is not None} | dict(lr or {}),
             dict(hr or {}),
             jitter=jitter,
+            hr_jitter=hr_jitter,
             exposure=exposure,
             camera=camera,
             reset=reset,

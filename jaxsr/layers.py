@@ -10,6 +10,8 @@ from typing import Literal, NamedTuple
 
 MAX_JITTER = 0.5 + 1e-4
 """Largest jitter along an axis, in LR pixels; a little more than half a pixel, for rounding."""
+MAX_HR_JITTER = 8.0
+"""Largest jitter of HR buffers along an axis, in HR pixels: half an LR pixel at the largest scale, 16."""
 RIGID_TOLERANCE = 1e-3
 """How far the entries of R'R may be from those of the identity, R the rotation of a camera."""
 

@@ -10,6 +10,15 @@ class Needs(NamedTuple):
     """Of a rendered frame."""
     extrapolated: frozenset[str] = frozenset()
     """Of a frame that is to be extrapolated, and of the rendered frames before it."""
+    hr_jitter: bool = False
+    """Whether the method accounts for jitter of the HR buffers. One that does not, and that reads more of
+    them than depth and motion, is not given frames where they are jittered."""
+
+    @property
+    def refuses_hr_jitter(self) -> bool:
+        """Whether frames with jittered HR buffers would come out wrong."""
+        read = {need for need in self.rendered | self.extrapolated if need.startswith("hr.")}
+        return not self.hr_jitter and not read <= {"hr.depth", "hr.motion"}
 
     def of(self, rendered: bool, extrapolating: bool = True) -> frozenset[str]:
         """What one frame must have.

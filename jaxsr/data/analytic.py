@@ -256,7 +256,13 @@ def gbuffer(layers: dict[str, Any]) -> GBuffer:
 
 
 def frame(
-    time: int, size: tuple[int, int], scale: int, jitter_px: tuple[float, float], *, rendered: bool = True
+    time: int,
+    size: tuple[int, int],
+    scale: int,
+    jitter_px: tuple[float, float],
+    *,
+    rendered: bool = True,
+    hr_jitter_px: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[Frame, np.ndarray]:
     """One `Frame` of HR `size` with its truth `[H, W, 3]`; an unrendered frame has no colour.
 
@@ -265,6 +271,8 @@ def frame(
         size: (width, height) of the HR image, whole multiples of `scale`.
         scale: HR size divided by LR size.
         jitter_px: J in LR pixels.
+        rendered: whether the frame has LR colour.
+        hr_jitter_px: J of the HR buffers, in HR pixels.
         rendered: False leaves the LR colour zero.
 
     Returns:
@@ -281,6 +289,7 @@ def frame(
             found=f"{size[0]} x {size[1]}",
         )
     hr = render(time, size)
+    buffers = render(time, size, jitter_px=hr_jitter_px) if any(hr_jitter_px) else hr
     lr = render(time, (size[0] // scale, size[1] // scale), jitter_px=jitter_px)
     view = Camera(*(value.astype(np.float32) for value in camera(time, size)))
     color: Any = lr["color"] if rendered else np.zeros_like(lr["color"])
@@ -289,8 +298,9 @@ def frame(
     result = Frame(
         color_linear=color,
         lr=gbuffer(lr),
-        hr=gbuffer(hr),
+        hr=gbuffer(buffers),
         jitter_px=jitter,
+        hr_jitter_px=np.asarray(hr_jitter_px, np.float32),  # type: ignore[arg-type]
         camera=view,
         reset=flags[0],
         rendered=flags[1],

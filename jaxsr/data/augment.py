@@ -105,6 +105,7 @@ def flip(window: Window, *, horizontal: bool = False, vertical: bool = False) ->
             lr=buffers(frames.lr),
             hr=buffers(frames.hr),
             jitter_px=_signed(frames.jitter_px, image),
+            hr_jitter_px=_signed(frames.hr_jitter_px, image),
             camera=camera,
         ),
         mirrored(window.truth_linear),

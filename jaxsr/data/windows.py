@@ -116,6 +116,7 @@ class WindowSource:
         made = [start + t for t in self.windows.targets]
         values: dict[str, Any] = {
             "jitter_px": np.array([info.jitter_px for info in infos], float) * (self.scale > 1),
+            "hr_jitter_px": np.array([info.hr_jitter_px for info in infos], float),
             "reset": np.array([info.reset for info in infos]),
             "rendered": np.array(self.windows.cadence),
             "exposure": np.array([clip.exposure_at(start + t) for t in range(len(infos))], float),

@@ -73,7 +73,7 @@ def _images(
     for k, info in enumerate(infos):
         before = infos[k - 1] if k and not info.reset else info
         for resolution in resolutions:
-            yield info, before, resolution, (0.0, 0.0) if resolution == "hr" else info.jitter_px
+            yield info, before, resolution, info.hr_jitter_px if resolution == "hr" else info.jitter_px
 
 
 def pack(

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jaxsr.errors import JaxsrError
-from jaxsr.layers import LAYERS, MAX_JITTER, is_rigid
+from jaxsr.layers import LAYERS, MAX_HR_JITTER, MAX_JITTER, is_rigid
 
 if TYPE_CHECKING:
     from jaxsr.frames import Camera
@@ -49,6 +49,8 @@ class FrameInfo:
     """(x, y), as in `frames.Camera`."""
     exposure: float | None = None
     """Factor on linear colour before the display tone map; None: that of the sequence."""
+    hr_jitter_px: Any = (0.0, 0.0)
+    """(x, y): J of the HR G-buffers in HR pixels; HR colour is never jittered."""
 
     @property
     def has_camera(self) -> bool:
@@ -72,6 +74,8 @@ class FrameInfo:
             "jitter_px": [float(x) for x in self.jitter_px],
             "reset": bool(self.reset),
         }
+        if any(self.hr_jitter_px):
+            entry["hr_jitter_px"] = [float(x) for x in self.hr_jitter_px]
         if self.exposure is not None:
             entry["exposure"] = float(self.exposure)
         if self.has_camera:
@@ -171,6 +175,7 @@ def frame_info(entry: Any, k: int, where: str | Path, conventions: bool = True) 
         info = FrameInfo(
             index=entry["index"],
             jitter_px=_pair(entry.get("jitter_px", [0, 0]), "jitter_px"),
+            hr_jitter_px=_pair(entry.get("hr_jitter_px", [0, 0]), "hr_jitter_px"),
             reset=reset,
             exposure=entry.get("exposure"),
             **fields,
@@ -181,8 +186,8 @@ def frame_info(entry: Any, k: int, where: str | Path, conventions: bool = True) 
         raise JaxsrError(
             f"entry {k} of frames is not right",
             where=where,
-            expected="index; where there are: jitter_px, reset, exposure, camera (world_from_view, "
-            "tan_half_fov, lens_shift)",
+            expected="index; where there are: jitter_px, hr_jitter_px, reset, exposure, camera "
+            "(world_from_view, tan_half_fov, lens_shift)",
             found=f"missing {e}" if isinstance(e, KeyError) else e,
         ) from e
     check_info(info, where, conventions)
@@ -210,6 +215,15 @@ def check_info(info: FrameInfo, where: object, conventions: bool = True) -> None
             expected="x and y in LR pixels, each within [-0.5, 0.5]",
             found=jitter.tolist(),
             fix="convert it to LR pixels (docs/conventions.md; jaxsr inspect finds its unit)",
+        )
+    hr_jitter = _finite(info.hr_jitter_px, (2,), f"{name}: bad hr_jitter_px", where)
+    if conventions and np.abs(hr_jitter).max() > MAX_HR_JITTER:
+        raise JaxsrError(
+            f"{name}: jitter of the HR buffers of more than {MAX_HR_JITTER} pixels",
+            where=where,
+            expected="x and y in HR pixels, each at most half an LR pixel",
+            found=hr_jitter.tolist(),
+            fix="convert it to HR pixels (docs/conventions.md)",
         )
     if not info.has_camera and info.tan_half_fov is None:
         return

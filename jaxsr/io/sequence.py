@@ -137,6 +137,7 @@ class Sequence:
             lr=_gbuffer(lr),
             hr=_gbuffer(hr),
             jitter_px=np.asarray((0.0, 0.0) if place == "hr" else info.jitter_px, np.float32),  # type: ignore[arg-type]
+            hr_jitter_px=np.asarray(info.hr_jitter_px, np.float32),  # type: ignore[arg-type]
             camera=info.camera,
             reset=np.asarray(info.reset),  # type: ignore[arg-type]
             rendered=np.asarray(rendered),  # type: ignore[arg-type]
@@ -187,7 +188,7 @@ class Sequence:
                 where=self.path / "sequence.json",
                 fix="export the camera, or the layer position (docs/data.md)",
             )
-        jitter = (0.0, 0.0) if resolution == "hr" else info.jitter_px
+        jitter = info.hr_jitter_px if resolution == "hr" else info.jitter_px
         layers = self._read(i, resolution, depth, depth)
         return world_from_depth(layers["depth"], info, jitter, np).astype(np.float32)
 

@@ -37,7 +37,7 @@ from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, GBuffer, Window
-from jaxsr.methods import guided, guided_taau, taau
+from jaxsr.methods import accumulation, guided, guided_taau
 from jaxsr.methods.base import Method, Needs, Net, Network, last_frames, module_maker, one_image
 from jaxsr.methods.history import plain_warp
 from jaxsr.methods.image_loss import ImageLoss, check_loss, image_loss
@@ -136,7 +136,7 @@ def color_input(frame: Frame, options: Options) -> Float[Array, "*b h w 3"]:
 def base_image(frame: Frame, options: Options) -> Float[Array, "H W 3"]:
     """E of one frame, as the network sees colour: the lighting of the alike samples around each HR pixel."""
     estimate = guided_taau.estimate(frame, options.estimate)
-    lighting = taau.from_working(estimate.color, frame.exposure)
+    lighting = accumulation.from_working(estimate.color, frame.exposure)
     if options.demodulated:
         return compress_lighting(lighting * frame.exposure)
     return to_display(guided.color_of(lighting, frame.hr, options.estimate.eps), frame.exposure)

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Frame, GBuffer, surface
 from jaxsr.methods import taau
+from jaxsr.methods.accumulation import State
 from jaxsr.methods.base import Method, Needs, Net
 from jaxsr.methods.history import Extrapolation, History, no_image
 from jaxsr.methods.options import check_options
@@ -131,18 +132,18 @@ def no_history(frame: Frame) -> History:
     return jax.tree.map(jnp.zeros_like, keep(no_image(frame), frame))
 
 
-def init(frame: Frame) -> taau.State:
+def init(frame: Frame) -> State:
     """An empty history with a surface."""
     last = no_history(frame)
     assert last.depth_linear is not None
-    return taau.State(last, last.depth_linear)
+    return State(last, last.depth_linear)
 
 
-def extrapolate(options: Options, state: taau.State, frame: Frame) -> tuple[taau.State, Array]:
+def extrapolate(options: Options, state: State, frame: Frame) -> tuple[State, Array]:
     """`reprojected` as the step of a method that has a weighted history: poor matches are worth less."""
     image, confidence = reprojected(state.last, frame, options)
     weight = backward_warp(state.weight, frame.hr.motion_px) * confidence
-    return taau.State(keep(image, frame), weight), image
+    return State(keep(image, frame), weight), image
 
 
 def method(options: Options | None = None, taau_options: taau.Options | None = None) -> Method:
@@ -155,9 +156,9 @@ def method(options: Options | None = None, taau_options: taau.Options | None = N
     o.check()
     upscaler = taau.method(taau_options)
 
-    def upscale(net: None, state: taau.State, frame: Frame) -> tuple[taau.State, Array]:
+    def upscale(net: None, state: State, frame: Frame) -> tuple[State, Array]:
         state, image = upscaler.upscale(net, state, frame)
-        return taau.State(keep(image, frame), state.weight), image
+        return State(keep(state.last.image, frame), state.weight), image
 
     return Method(
         "guided",

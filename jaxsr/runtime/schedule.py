@@ -66,7 +66,8 @@ def check_needs(method: Method, sequence: Sequence, scale: int, every: int = 1) 
     """Say at once what a sequence lacks for a method, from the headers of its first files.
 
     Raises:
-        JaxsrError: the first frame does not have all the buffers, or motion is zero where the camera moves.
+        JaxsrError: the first frame does not have all the buffers, the HR ones are jittered and the method
+            does not account for it, or motion is zero where the camera moves.
     """
     needs = method.needs.of(True, every > 1)
     have = available(sequence, scale)
@@ -77,6 +78,13 @@ def check_needs(method: Method, sequence: Sequence, scale: int, every: int = 1) 
             where=sequence.path,
             found=", ".join(sorted(have)),
             fix="export these buffers, or choose a method that does without (jaxsr inspect lists them)",
+        )
+    if method.needs.refuses_hr_jitter and any(any(info.hr_jitter_px) for info in sequence.infos):
+        raise JaxsrError(
+            f"method {method.name!r} does not account for jittered HR buffers",
+            where=sequence.path,
+            expected="hr_jitter_px 0 in all frames",
+            fix="use guided-taau, or export HR buffers without jitter",
         )
     cameras = all(info.has_camera for info in sequence.infos[:2])
     if cameras and "hr.motion" in needs and len(sequence) > 1 and not sequence.infos[1].reset:

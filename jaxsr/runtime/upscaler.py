@@ -4,6 +4,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from jaxsr.errors import JaxsrError
@@ -124,6 +125,14 @@ class Upscaler:
                 where=self.name,
                 expected=", ".join(sorted(self.needs.rendered if rendered else self.needs.extrapolated)),
                 fix="give them to Frame.of, or choose a method that does without",
+            )
+        if self.needs.refuses_hr_jitter and np.any(np.asarray(frame.hr_jitter_px)):
+            raise JaxsrError(
+                "the method does not account for jittered HR buffers",
+                where=self.name,
+                expected="hr_jitter 0",
+                found=np.asarray(frame.hr_jitter_px).tolist(),
+                fix="use guided-taau, or HR buffers without jitter",
             )
         return frame._replace(lr=small, hr=large)
 

@@ -16,7 +16,7 @@ from flax import nnx
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import FIELDS, Window
-from jaxsr.methods import METHODS, build, fusion_sr, guided, guided_taau, taau, variant
+from jaxsr.methods import METHODS, accumulation, build, fusion_sr, guided, guided_taau, variant
 from jaxsr.methods.base import step
 from jaxsr.methods.fusion_sr import Options, displayed
 from jaxsr.methods.image_loss import ImageLoss, middle
@@ -247,7 +247,7 @@ def test_an_extrapolated_frame_never_sees_its_colour():
 def test_it_extrapolates_by_guided_reprojection_of_its_output():
     frames = clip()
     last = guided.keep(jnp.asarray(streamed()[0]), frames[0])
-    state = taau.State(last, jnp.ones((*SIZE[::-1], 1)))
+    state = accumulation.State(last, jnp.ones((*SIZE[::-1], 1)))
     _, expected = guided.extrapolate(guided.Options(), state, frames[1])
     np.testing.assert_allclose(streamed()[1], expected, rtol=1e-4, atol=1e-5)
 
@@ -416,7 +416,7 @@ def test_untrained_it_is_the_guided_upsampling(monkeypatch):
         frame = frame_at(t)[0]._replace(exposure=jnp.asarray(1.5))
         _, image = step_of("default")(net, method_of("default").init(frame), frame)
         color = guided_taau.estimate(frame, guided_taau.Upsampling()).color
-        estimate = taau.from_working(color, frame.exposure)
+        estimate = accumulation.from_working(color, frame.exposure)
         expected = guided.color_of(estimate, frame.hr, 0.02)
         np.testing.assert_allclose(image, expected, rtol=1e-3, atol=1e-4)
 

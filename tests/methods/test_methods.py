@@ -10,7 +10,7 @@ import pytest
 from jaxsr.data import analytic
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import Camera, Frame
-from jaxsr.methods import METHODS, taau
+from jaxsr.methods import METHODS, accumulation, taau
 from jaxsr.methods.base import step
 from jaxsr.methods.history import History
 from jaxsr.ops import camera_motion, jitter_sequence, to_display, upsample
@@ -161,7 +161,8 @@ def test_guided_beats_plain_warp_where_it_extrapolates():
     assert gain[0] == 0.0  # the first frame has no history: both upscale alike
 
 
-def test_taau_history_does_not_bleed_across_a_silhouette():
+@pytest.mark.parametrize("dilated", [False, True])
+def test_taau_history_does_not_bleed_across_a_silhouette(dilated):
     """A pixel whose bilinear taps straddle two depths takes the tap of its own surface only."""
     frames, _ = clip(2, 2)
     frame = jax.tree.map(jnp.asarray, frames[1])
@@ -173,12 +174,14 @@ def test_taau_history_does_not_bleed_across_a_silhouette():
     here = frame._replace(
         hr=frame.hr._replace(depth_linear=depth, motion_px=motion), reset=jnp.asarray(False)
     )
-    state = taau.State(History(image, depth), jnp.ones((h, w, 1)))
-    history, weight = taau.fetch_history(image, state, here, taau.Options())
-    right_edge = history[1:, w // 2]  # its left tap lies on the near surface
+    state = accumulation.State(History(image, depth), jnp.ones((h, w, 1)))
+    options = accumulation.Accumulation(dilated=dilated)
+    history, weight = accumulation.fetch_history(image, state, here, options)
+    edge = w // 2 + dilated  # a dilated silhouette is one pixel wider, on both sides of the step
+    right_edge = history[2:-1, edge]  # its left tap lies on the near surface
     np.testing.assert_allclose(right_edge, 5.0, rtol=1e-6)
-    assert (weight[1:, w // 2] < 1).all()
-    assert (weight[1:, w // 2] > 0).all()
+    assert (weight[2:-1, edge] < 1).all()
+    assert (weight[2:-1, edge] > 0).all()
 
 
 def test_stream_names_what_is_wrong():
@@ -259,8 +262,8 @@ def test_history_counts_for_nothing_in_disocclusions(change):
     motion = jnp.full((h, w, 2), {"depth": 0.25, "motion": 300.0, "infinite motion": jnp.inf}[change])
     here = frame._replace(hr=frame.hr._replace(depth_linear=depth, motion_px=motion))
     image, before = jnp.ones((h, w, 3)), depth * (2 if change == "depth" else 1)
-    state = taau.State(History(image, before), jnp.ones((h, w, 1)))
-    _, weight = taau.fetch_history(image, state, here, taau.Options())
+    state = accumulation.State(History(image, before), jnp.ones((h, w, 1)))
+    _, weight = accumulation.fetch_history(image, state, here, taau.Options())
     np.testing.assert_allclose(weight, 0.0, atol=1e-6)
 
 
@@ -275,7 +278,7 @@ def walk(step, known=True):
     now = before._replace(world_from_view=jnp.eye(4).at[2, 3].set(10 * step))
     depth, far = jnp.full((h, w, 1), 10 * (1 - step)), jnp.full((h, w, 1), 10.0)
     hr = frame.hr._replace(depth_linear=depth, motion_px=camera_motion(depth, now, before))
-    state = taau.State(
+    state = accumulation.State(
         History(jnp.ones((h, w, 3)), far, camera=before if known else None), jnp.ones((h, w, 1))
     )
     return frame._replace(hr=hr, camera=now if known else None), state
@@ -284,12 +287,13 @@ def walk(step, known=True):
 @pytest.mark.parametrize("step", [0.005, 0.03, 0.2, 0.5, -0.5])
 def test_a_camera_that_walks_towards_a_wall_keeps_its_history(step):
     frame, state = walk(step)
-    _, weight = taau.fetch_history(state.last.image, state, frame, taau.Options())
+    options = accumulation.Accumulation()
+    _, weight = accumulation.fetch_history(state.last.image, state, frame, options)
     inside = slice(16, -16), slice(28, -28)  # walking backwards, the border comes into view
     np.testing.assert_allclose(weight[inside], 1.0, atol=1e-5)
     if step > 0.02:  # nothing but the camera tells
         frame, state = walk(step, known=False)
-        _, weight = taau.fetch_history(state.last.image, state, frame, taau.Options())
+        _, weight = accumulation.fetch_history(state.last.image, state, frame, options)
         np.testing.assert_allclose(weight, 0.0, atol=1e-6)
 
 
@@ -310,13 +314,15 @@ def test_light_that_changes_is_a_ratio_of_means(factor):
             black = 0.01 * share[block].sum() + 1e-6
             change = np.log((now + black) / (factor * now + black))
             expected[y, x] = 2 ** -((change / 0.2) ** 2)
-    light = taau.same_light(*map(jnp.asarray, (samples, history, weight)), options)
+    light = accumulation.same_light(*map(jnp.asarray, (samples, history, weight)), options)
     np.testing.assert_allclose(light, upsample(jnp.asarray(expected), 2, "bilinear"), atol=1e-5)
-    nothing = taau.same_light(jnp.asarray(samples), jnp.asarray(history), jnp.zeros((8, 12, 1)), options)
+    nothing = accumulation.same_light(
+        jnp.asarray(samples), jnp.asarray(history), jnp.zeros((8, 12, 1)), options
+    )
     assert np.isfinite(nothing).all()  # no history: nothing to compare with
 
 
 def test_the_slope_of_one_row_is_that_of_its_columns():
     inverse = jnp.array([1.0, 0.9, 0.8, 0.7])[None, :, None]
-    np.testing.assert_allclose(taau.slope(inverse), 0.1, rtol=1e-5)
-    np.testing.assert_allclose(taau.slope(jnp.ones((1, 1, 1))), 0.0)
+    np.testing.assert_allclose(accumulation.slope(inverse), 0.1, rtol=1e-5)
+    np.testing.assert_allclose(accumulation.slope(jnp.ones((1, 1, 1))), 0.0)

@@ -1,6 +1,7 @@
 """Methods that divide colour by base colour: black paint, sky, and what poor matches are worth."""
 
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxsr.data import analytic
-from jaxsr.methods import METHODS, guided, taau
+from jaxsr.methods import METHODS, accumulation, guided, guided_taau
 from jaxsr.methods.history import History
 from jaxsr.ops import jitter_sequence, to_display
 from jaxsr.runtime.load import find_method
@@ -163,7 +164,11 @@ def extrapolated_weight(name, change):
         last = History(last.image, last.depth_linear)
     weight = jnp.ones((*SIZE[::-1], 1))
     weight = weight.at[:, :8].set(0.25)
-    state, _ = jax.jit(method.extrapolate)(None, taau.State(last, weight), change(frame))
+    state: Any = accumulation.State(last, weight)
+    if name == "guided-taau":
+        last = guided_taau.keep(last.image, frame)
+        state = guided_taau.State(last, weight, last.image, weight)
+    state, _ = jax.jit(method.extrapolate)(None, state, change(frame))
     return np.asarray(state.weight)[..., 0]
 
 
