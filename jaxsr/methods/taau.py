@@ -39,6 +39,11 @@ from jaxsr.methods.base import Method, Needs
 from jaxsr.methods.history import History, no_image
 from jaxsr.ops import backward_warp
 
+ALIKE = -3.0
+"""Log of the likeness from which a sample shows the surface of a pixel."""
+ANY = 10.0
+"""Beyond all colours in working space: a box from -ANY to ANY clips nothing."""
+
 
 @dataclass(frozen=True)
 class Options(Accumulation):
@@ -46,6 +51,7 @@ class Options(Accumulation):
 
     sample_sigma: float = 0.6
     memory: float = 8.0
+    rest_memory: float = 2.0
     box: float = 1.6
     rest_box: float = 5.0
     smooth: float = 0.1
@@ -53,7 +59,7 @@ class Options(Accumulation):
     dilated: bool = True
     kernel_sigma: float = 0.28
     """Reconstruction kernel, in LR pixels."""
-    smooth_sigma: float = 0.5
+    smooth_sigma: float = 0.6
     """The wider kernel, in LR pixels."""
 
     def check(self) -> None:
@@ -132,7 +138,7 @@ def estimate(
             total, color = total + weight, color + weight * values
             weight = jnp.exp(log_alike - best_alike - squared / (2 * smooth_sigma**2))
             wide, smooth = wide + weight, smooth + weight * values
-            counts = log_alike >= best_alike - 3.0
+            counts = log_alike >= best_alike + ALIKE
             low = jnp.minimum(low, jnp.where(counts, values, jnp.inf))
             high = jnp.maximum(high, jnp.where(counts, values, -jnp.inf))
             hit = jnp.exp(log_alike - squared * scale**2 / (2 * sample_sigma**2))
@@ -144,6 +150,9 @@ def estimate(
     (best, best_alike), found = jax.lax.scan(most, (one - jnp.inf, one - jnp.inf), rows)
     start: tuple[Array, ...] = (one, three, three + jnp.inf, three - jnp.inf, one, one, three)
     total, color, low, high, confidence, wide, smooth = jax.lax.scan(add, start, (rows, found))[0]
+    # Where no sample shows the surface of the pixel, they say nothing against its history.
+    strange = best_alike < ALIKE
+    low, high = jnp.where(strange, -ANY, low), jnp.where(strange, ANY, high)
     return Estimate(color / total, low, high, confidence, smooth / wide)
 
 
