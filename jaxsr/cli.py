@@ -9,7 +9,7 @@ import json as json_module
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 from tyro.conf import Positional
@@ -90,6 +90,7 @@ def compare(
     fps: float = 4.0,
     lpips: bool = True,
     lpips_alex: bool = False,
+    layer: Literal["reference", "color"] | None = None,
 ) -> None:
     """Measure folders of frames against the truth and write the comparison page.
 
@@ -103,6 +104,8 @@ def compare(
         fps: the speed at which the page plays at first, in frames per second.
         lpips: also measure LPIPS, if the extra `perceptual` is installed; this takes most of the time.
         lpips_alex: also measure LPIPS with AlexNet, which no training loss uses.
+        layer: the layer of a truth that is a sequence: `reference`, which is anti-aliased, or `color`, which is
+            not. The default is the reference if all frames have one.
     """
     from rich.console import Console
 
@@ -118,6 +121,7 @@ def compare(
             out,
             exposure=exposure,
             fps=fps,
+            layer=layer,
             meta=description(),
             keys=metrics_with(lpips, lpips_alex),
             progress=progress,
@@ -173,6 +177,7 @@ def evaluate(
     warmup: int = 0,
     lpips: bool = True,
     lpips_alex: bool = False,
+    truth: Literal["reference", "color"] | None = None,
     out: Annotated[Path, tyro.conf.arg(aliases=["-o"])] = Path("jaxsr-evaluation"),
 ) -> None:
     """Run methods over sequences and measure them: tables, the comparison page, metrics of every frame.
@@ -189,6 +194,8 @@ def evaluate(
         warmup: the number of frames at the start of each sequence that are made but not measured.
         lpips: also measure LPIPS, if the extra `perceptual` is installed; this takes most of the time.
         lpips_alex: also measure LPIPS with AlexNet, which no training loss uses.
+        truth: the layer to measure against: `reference`, which is anti-aliased, or `color`, which is not. The
+            default is the reference if all frames have one.
         out: the folder for all results.
     """
     from rich.console import Console
@@ -207,6 +214,7 @@ def evaluate(
             out,
             settings,
             frames=_frame_range(frames),
+            truth=truth,
             meta=description(**settings._asdict()),
             progress=progress,
         )
@@ -223,6 +231,8 @@ def render(
     scale: tuple[int, ...] = (4,),
     size: tuple[int, int] | None = None,
     samples: int | None = None,
+    reference_samples: int | None = None,
+    jitter_hr: bool = False,
     denoise: bool | None = None,
     position: bool = True,
     seed: int = 0,
@@ -240,6 +250,9 @@ def render(
         scale: one or more factors between high and low resolution; 1 renders high resolution only.
         size: width and height of the high resolution; the default is the size in the scene.
         samples: samples per pixel of the colour; the default is the number in the scene.
+        reference_samples: samples per pixel of the reference, an anti-aliased high-resolution colour. The
+            default is the number of the colour; 0 renders none.
+        jitter_hr: jitter the high-resolution G-buffers too; guided-taau makes smoother images with them.
         denoise: denoise the colour; the default is the setting of the scene.
         position: also store world positions; without them readers rebuild them from depth and camera.
         seed: the seed of the renderer's noise.
@@ -265,6 +278,8 @@ def render(
             scale,
             size=size,
             samples=samples,
+            reference_samples=reference_samples,
+            jitter_hr=jitter_hr,
             denoise=denoise,
             position=position,
             seed=seed,

@@ -41,6 +41,7 @@ class Layer(NamedTuple):
 
 _ROWS = (
     Layer("color", "RGB", "color_linear", "scene-linear colour", -math.inf, math.inf, "half", None),
+    Layer("reference", "RGB", "", "anti-aliased scene-linear colour", -math.inf, math.inf, "half", None),
     Layer("depth", "Z", "depth_linear", "linear view depth", 0.0, math.inf, "float", math.inf),
     Layer("motion", "XY", "motion_px", "backward, pixels of its image", -math.inf, math.inf, "float", None),
     Layer("normal", "XYZ", "normal", "unit vector, world space", -1.0, 1.0, "half", 0.0),

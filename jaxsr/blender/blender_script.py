@@ -7,17 +7,20 @@ Imports bpy and the standard library only. The job is a JSON object: `scene` ({"
 path, "arguments": {...}} with a function `build` and a dict `SETTINGS`), `out` (folder), and, each null for
 the scene's own: `frames` [first, last], `size` [W, H], `samples`, `denoise`, `exposure`; further `scales`,
 `jitter_px` (a cycle of [x, y] in LR pixels: frame f uses entry (f - 1) mod length), `seed`, `threads`, `skip`
-(frame numbers), `only` (subset of "hr", "x2", ... or null), `color_only`. With `attended`, one line of JSON
-with further entries of the job is read from stdin after the scene was loaded, and the end of stdin (the
-parent is gone) ends the process, also in the middle of a render.
+(frame numbers), `only` (subset of "hr", "x2", ... or null), `color_only`, `jitter_hr` (the HR G-buffer is
+jittered too, by the same numbers in HR pixels), `reference` (samples per pixel of an anti-aliased HR colour,
+0 for none, null for as many as the colour has). With `attended`, one line of JSON with further entries of the
+job is read from stdin after the scene was loaded, and the end of stdin (the parent is gone) ends the process,
+also in the middle of a render.
 
 Writes `scene.json`, `0001.json` (cameras of frames f and f - 1, without jitter) and `0001_hr_color.exr`,
-`0001_hr_gbuffer.exr`, `0001_x2_color.exr`, ... Each is written under a temporary name and renamed; files that
-exist are not rendered again. stdout carries one JSON object a line: {"event": "scene" | "render" | "frame" |
+`0001_hr_gbuffer.exr`, `0001_hr_reference.exr`, `0001_x2_color.exr`, ... Each is written under a temporary
+name and renamed; files that exist are not rendered again. stdout carries one JSON object a line: {"event": "scene" | "render" | "frame" |
 "done" | "error", ...}; what Blender prints goes to stderr.
 
 Rendering: Cycles on the CPU, no anti-aliasing (all samples of a pixel within 0.005 pixels of its centre), no
-motion blur, no depth of field, no compositing. The G-buffer is a render of its own at one sample.
+motion blur, no depth of field, no compositing. The G-buffer is a render of its own at one sample. The
+reference alone is anti-aliased: its samples lie under a Blackman-Harris filter of 1.5 pixels.
 """
 
 import hashlib
@@ -37,6 +40,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parent))
 from blender_aovs import RENDERED_TYPES, prepare_materials
 
 FILTER_WIDTH = 0.01
+REFERENCE_FILTER_WIDTH = 1.5
 
 
 class JobError(Exception):
@@ -146,6 +150,7 @@ def plan(scene: Any, settings: dict, job: dict) -> dict:
         "adaptive": bool(
             scene.cycles.use_adaptive_sampling and job.get("samples") is None and not settings.get("samples")
         ),
+        "reference": int(choose("reference", choose("samples", scene.cycles.samples))),
         "denoise": bool(choose("denoise", scene.cycles.use_denoising)),
         "exposure": float(choose("exposure", 2.0**scene.view_settings.exposure)),
         "fps": render.fps / render.fps_base,
@@ -278,8 +283,11 @@ class Renderer:
         only = self.job.get("only")
         return [n for n in named if only is None or n[0] in only]
 
-    def kinds(self) -> tuple[str, ...]:
-        return ("color",) if self.job.get("color_only") else ("gbuffer", "color")
+    def kinds(self, name: str) -> tuple[str, ...]:
+        if self.job.get("color_only"):
+            return ("color",)
+        reference = ("reference",) if name == "hr" and self.described["reference"] else ()
+        return ("gbuffer", "color", *reference)
 
     def shift(self, camera: Any, jitter_px: list[float], size: list[int]) -> None:
         """Moves the lens so that I_J(p) = I_N(p + J), whatever the camera's sensor fit."""
@@ -321,8 +329,9 @@ class Renderer:
     def render(self, frame: int, number: int, name: str, size: list[int], kind: str, path: Path) -> None:
         scene, cycles, described = self.scene, self.scene.cycles, self.described
         scene.render.resolution_x, scene.render.resolution_y = size
-        color = kind == "color"
-        cycles.samples = described["samples"] if color else 1
+        color = kind != "gbuffer"
+        cycles.samples = {"color": described["samples"], "reference": described["reference"]}.get(kind, 1)
+        cycles.filter_width = REFERENCE_FILTER_WIDTH if kind == "reference" else FILTER_WIDTH
         cycles.use_adaptive_sampling = described["adaptive"] and color
         cycles.use_denoising = described["denoise"] and color
         cycles.seed = (self.job["seed"] * 7919 + frame * 31 + number) % (2**31) if color else 0
@@ -340,7 +349,7 @@ class Renderer:
         jobs = [
             (number, name, size, scale, kind, self.out / f"{frame:04d}_{name}_{kind}.exr")
             for number, (name, size, scale) in enumerate(self.resolutions())
-            for kind in self.kinds()
+            for kind in self.kinds(name)
         ]
         info = self.out / f"{frame:04d}.json"
         missing = [j for j in jobs if not j[-1].is_file()]
@@ -349,7 +358,8 @@ class Renderer:
             jitter = cycle[(frame - 1) % len(cycle)]
             camera, described = self.cameras(frame)
             for number, name, size, scale, kind, path in missing:
-                self.shift(camera, jitter if scale else [0.0, 0.0], size)
+                moved = scale or (kind == "gbuffer" and self.job.get("jitter_hr"))
+                self.shift(camera, jitter if moved else [0.0, 0.0], size)
                 self.render(frame, number, name, size, kind, path)
             write_json(info, {**described, "jitter_px": jitter})
         self.events("frame", frame=frame)

@@ -49,6 +49,8 @@ def render(
     *,
     size: tuple[int, int] | None = None,
     samples: int | None = None,
+    reference_samples: int | None = None,
+    jitter_hr: bool = False,
     denoise: bool | None = None,
     exposure: float | None = None,
     seed: int = 0,
@@ -72,6 +74,8 @@ def render(
         scales: LR scales; 1 or none renders HR only.
         size: HR `(W, H)`; None for the scene's resolution. Divisible by every scale.
         samples: of the colour; None for the scene's, with its adaptive sampling.
+        reference_samples: of the anti-aliased HR colour; None for as many as the colour has, 0 for none.
+        jitter_hr: jitter the HR G-buffer too, by the numbers of the frame's jitter in HR pixels.
         denoise: of the colour, with OpenImageDenoise; None for the scene's choice.
         exposure: written to sequence.json; None: 2 to the power of the scene's view exposure.
         seed: of Cycles' noise.
@@ -97,7 +101,7 @@ def render(
     if scene.suffix not in (".blend", ".py") or not scene.is_file():
         found = "no such file" if not scene.exists() else scene.suffix or "a folder"
         raise JaxsrError("not a scene", where=scene, expected="a .blend file (or a .py scene)", found=found)
-    _check_arguments(frames, scales, size, samples, threads)
+    _check_arguments(frames, scales, size, samples, threads, reference_samples)
     program = find_blender(blender)
     source: dict[str, Any] = {"blend": str(scene)}
     if scene.suffix == ".py":
@@ -112,6 +116,8 @@ def render(
         "denoise": denoise,
         "exposure": exposure,
         "jitter_px": jitter_sequence(JITTER_LENGTH, JITTER_LENGTH).tolist(),
+        "jitter_hr": jitter_hr,
+        "reference": reference_samples,
         "seed": seed,
         "threads": threads,
         "attended": True,
@@ -129,6 +135,7 @@ def render(
             "blender": described["blender"],
             "seed": seed,
             **{key: described[key] for key in ("samples", "adaptive", "denoise", "bounces")},
+            **({"reference_samples": described["reference"]} if described["reference"] else {}),
         }
         writer = SequenceWriter(
             out,
@@ -152,11 +159,12 @@ def render(
         key = {**job, "threads": None, "attended": None, "described": described}
         raw = _raw_folder(out / ".raw", json.dumps(key, sort_keys=True))
         process.answer({"skip": done, "out": str(raw)})
-        report = _Reporter(progress, first, last, len(done), described, [s for s in scales if s > 1])
+        lr = [s for s in scales if s > 1]
+        report = _Reporter(progress, first, last, len(done), described, lr)
         for event in process.events():
             report(event)
             if event["event"] == "frame":
-                _take_over(raw, event["frame"], [s for s in scales if s > 1], described, position, writer)
+                _take_over(raw, event["frame"], lr, described, position, jitter_hr, writer)
     writer.close()
     shutil.rmtree(out / ".raw", ignore_errors=True)
     return out
@@ -180,7 +188,12 @@ def _tidied(out: Path, log: Path) -> Iterator[None]:
 
 
 def _check_arguments(
-    frames: Any, scales: Sequence[int], size: Any, samples: int | None, threads: int | None
+    frames: Any,
+    scales: Sequence[int],
+    size: Any,
+    samples: int | None,
+    threads: int | None,
+    reference_samples: int | None,
 ) -> None:
     if any(not 1 <= s <= 16 for s in scales):
         raise JaxsrError(
@@ -190,6 +203,7 @@ def _check_arguments(
         raise JaxsrError("an empty range of frames", where="--frames", found=f"{frames[0]}:{frames[1]}")
     for flag, number in (
         ("--samples", samples),
+        ("--reference-samples", reference_samples or None),
         ("--threads", threads),
         *(("--size", n) for n in size or ()),
     ):
@@ -213,6 +227,7 @@ def _take_over(
     scales: Sequence[int],
     described: Mapping[str, Any],
     position: bool,
+    jitter_hr: bool,
     writer: SequenceWriter,
 ) -> None:
     """Converts and writes one finished frame, then deletes its raw files."""
@@ -221,17 +236,19 @@ def _take_over(
     instances = Instances(described["objects"], described["instanced"], described["instances"])
     jitter = (float(info["jitter_px"][0]), float(info["jitter_px"][1]))
 
+    hr_jitter = jitter if jitter_hr else (0.0, 0.0)
+
     def layers(resolution: str, jitter_px: tuple[float, float]) -> dict[str, np.ndarray]:
         gbuffer, _ = read_exr(raw / f"{frame:04d}_{resolution}_gbuffer.exr")
-        color, _ = read_exr(raw / f"{frame:04d}_{resolution}_color.exr")
+        files = {name: raw / f"{frame:04d}_{resolution}_{name}.exr" for name in ("color", "reference")}
         return {
-            "color": convert_color(color),
+            **{name: convert_color(read_exr(file)[0]) for name, file in files.items() if file.exists()},
             **convert_gbuffer(gbuffer, camera, previous, jitter_px, instances, position),
         }
 
     writer.write_frame(
-        FrameInfo(frame, jitter, info["cut"] or not writer.has(frame - 1), *camera),
-        layers("hr", (0.0, 0.0)),
+        FrameInfo(frame, jitter, info["cut"] or not writer.has(frame - 1), *camera, hr_jitter_px=hr_jitter),
+        layers("hr", hr_jitter),
         {s: layers(f"x{s}", jitter) for s in scales},
     )
     for path in raw.glob(f"{frame:04d}[_.]*"):
@@ -254,6 +271,8 @@ class _Reporter:
         # A G-buffer costs about as much as two samples of colour (measured on three scenes).
         cost = {"color": described["samples"] + 0.5, "gbuffer": 2.0}
         work = {("hr" if s == 1 else f"x{s}", k): c / s**2 for s in (1, *scales) for k, c in cost.items()}
+        if described["reference"]:
+            work["hr", "reference"] = described["reference"] + 0.5
         self.share = {key: value / sum(work.values()) for key, value in work.items()}
 
     def __call__(self, event: Mapping[str, Any]) -> None:

@@ -59,6 +59,7 @@ class WindowSource:
         windows: Windows,
         *,
         scale: int,
+        truth: str = "color",
         held_back: int = 0,
         cache: Path | None = None,
         progress: Progress = silent,
@@ -72,7 +73,7 @@ class WindowSource:
             raise JaxsrError("bad scale", expected="1 or more", found=scale)
         if held_back < 0:
             raise JaxsrError("bad number of held-back frames", expected="0 or more", found=held_back)
-        self.scale, self.windows, self.held_back = scale, windows, held_back
+        self.scale, self.windows, self.truth, self.held_back = scale, windows, truth, held_back
         self._layers = {place: needed(read, place) for place in ("lr", "hr")}
         self.sequences: list[Clip] = []
         self._arrays: list[tuple[Arrays, Arrays]] = []
@@ -87,11 +88,11 @@ class WindowSource:
             clip.layers(lr)
             self.sequences.append(clip)
             self._starts.append(_starts(clip, windows.length, held_back))
-        truth = {"hr.color", "lr.color"} if windows.lr_truth else {"hr.color"}
+        demanded = read | {f"hr.{truth}"} | ({"lr.color"} if windows.lr_truth else set())
         for path in paths:
             found = open_arrays(path, self.resolutions, cache=cache, progress=progress)
             self._arrays.append((found[lr], found["hr"]))
-            for need in sorted(read | truth):
+            for need in sorted(demanded):
                 place, layer = need.split(".")
                 _check_layer(found[lr if place == "lr" else "hr"], layer, need)
         self._has_cameras = all(info.has_camera for clip in self.sequences for info in clip.infos)
@@ -133,7 +134,7 @@ class WindowSource:
                 factor=Scale(self.scale),
                 **values,
             ),
-            _pick(hr.layers["color"], made),
+            _pick(hr.layers[self.truth], made),
             _pick(lr.layers["color"], made) if self.windows.lr_truth else None,
         )
 

@@ -24,6 +24,8 @@ from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.measuring import Meter, Truth
 from jaxsr.io.images import read_color, read_png, write_png
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.io.truth import Truth as TruthLayer
+from jaxsr.io.truth import choose_truth
 from jaxsr.ops.color import to_display
 from jaxsr.progress import Advance, Progress, silent
 from jaxsr.report.page import write_report
@@ -132,15 +134,15 @@ def labels(folders: Sequence[Path]) -> list[str]:
     raise JaxsrError("the same folder is given twice", found=", ".join(str(f) for f in folders))
 
 
-def read_display(path: Path, exposure: float) -> np.ndarray:
-    """A frame as display-referred float32 [H, W, 3] in [0, 1].
+def read_display(path: Path, exposure: float, layer: str = "color") -> np.ndarray:
+    """A frame as display-referred float32 [H, W, 3] in [0, 1]; `layer` is the first choice of an OpenEXR file.
 
     Raises:
         JaxsrError: unreadable or truncated file, no colour in it, NaN or infinity.
     """
     if path.suffix.lower() != ".exr":
         return read_png(path)
-    linear = read_color(path)
+    linear = read_color(path, layer=layer)
     bad = np.argwhere(~np.isfinite(linear).all(axis=-1))
     if len(bad):
         y, x = (int(v) for v in bad[0])
@@ -186,6 +188,7 @@ def compare(
     out: Path,
     *,
     exposure: float | None = None,
+    layer: TruthLayer | None = None,
     fps: float = 4.0,
     title: str = "",
     meta: Mapping[str, Any] | None = None,
@@ -201,6 +204,7 @@ def compare(
         out: where the results go; made if it is not there.
         exposure: factor on linear colour before the tone map; by default that of the truth if it is a
             sequence, else 1.
+        layer: of a truth that is a sequence; by default the reference if all frames have one, else the colour.
         fps: speed at which the page plays at first.
         meta: shown on the page and kept with the numbers.
         max_megabytes: aim for the size of the page.
@@ -227,12 +231,12 @@ def compare(
     names = labels([Path(folder) for folder in folders])
     for frames in given:
         check_match(frames, true)
-    exposures = _exposures(true, exposure)
+    exposures, layer = _exposures(true, exposure), _layer(true, layer)
     starts = _starts(true)
     advance = progress("measuring", len(given) * len(true.files))
     title = title or f"{' · '.join(names)} against {truth.resolve().name}"
     with _staging(out) as folder:
-        shown = _Shown(folder, exposures)
+        shown = _Shown(folder, exposures, layer)
         section = SequenceResult(
             title=f"{truth.resolve().name}: {', '.join(names)}" if len(names) < 4 else truth.resolve().name,
             frames=true.numbers or tuple(range(1, len(true.files) + 1)),
@@ -242,7 +246,11 @@ def compare(
                 for name, frames in zip(names, given, strict=True)
             ],
             exposure=exposures[0],
-            meta={"truth": str(truth), **{name: str(f) for name, f in zip(names, folders, strict=True)}},
+            meta={
+                "truth": str(truth),
+                "layer": layer,
+                **{name: str(f) for name, f in zip(names, folders, strict=True)},
+            },
         )
         write_report(
             folder / "report.html", [section], title=title, meta=meta, fps=fps, max_megabytes=max_megabytes
@@ -258,6 +266,15 @@ def compare(
             for result, name, frames in zip(section.methods, names, given, strict=True)
         ],
     )
+
+
+def _layer(truth: Frames, layer: TruthLayer | None) -> TruthLayer:
+    """The layer of the truth that is compared with: of a folder of plain pictures there is one only."""
+    if not (truth.folder / "sequence.json").is_file():
+        if layer == "reference":
+            raise JaxsrError("the truth is no sequence: it has no layers", where=truth.folder)
+        return "color"
+    return choose_truth([FrameSequence.open(truth.folder)], layer)
 
 
 @contextlib.contextmanager
@@ -288,10 +305,13 @@ class _Shown(NamedTuple):
     out: Path
     exposures: Sequence[float]
     """Of each frame."""
+    layer: str
+    """Of the truth."""
 
     def read(self, label: str, file: Path, position: int) -> np.ndarray:
         """The display-referred frame; the PNG of an OpenEXR frame is written on the way."""
-        image = read_display(file, self.exposures[position])
+        layer = self.layer if label == "truth" else "color"
+        image = read_display(file, self.exposures[position], layer)
         path = self.path(label, file)
         if path != file:
             write_png(path, image)

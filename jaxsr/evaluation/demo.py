@@ -73,7 +73,7 @@ def run_demo(
                     compiled=compiled,
                 )
             )
-    meta = description(scale=scale)
+    meta = description(scale=scale, truth=sorted({str(section.meta["truth"]) for section in sections}))
     advance = progress("page", 1)
     write_metrics(out, sections, title="jaxsr demo", meta=meta)
     write_report(out / "report.html", sections, title="jaxsr demo", meta=meta)

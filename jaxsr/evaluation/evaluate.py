@@ -17,6 +17,7 @@ from jaxsr.evaluation.measuring import Reference
 from jaxsr.evaluation.running import Evaluation, Settings, run_methods
 from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.io.truth import Truth, choose_truth
 from jaxsr.progress import Progress
 from jaxsr.report.page import write_report
 from jaxsr.report.results import SequenceResult
@@ -70,14 +71,6 @@ def part(sequence: FrameSequence, frames: tuple[int, int] | None) -> FrameSequen
 
 def _check(sequence: FrameSequence, methods: Sequence[LoadedMethod], settings: Settings) -> None:
     """See that every method can be run and measured, before any work is done."""
-    for i in range(len(sequence)):
-        if "color" not in sequence.layers("hr", i):
-            raise JaxsrError(
-                f"frame {sequence.infos[i].index} has no truth",
-                where=sequence.path,
-                expected="layer 'color' in hr/",
-                fix="render it, or use `jaxsr upscale`, which needs none",
-            )
     settings.check(sequence)
     for loaded in methods:
         check_needs(loaded.method, sequence, settings.scale, settings.every)
@@ -90,6 +83,7 @@ def evaluate(
     settings: Settings,
     *,
     frames: tuple[int, int] | None = None,
+    truth: Truth | None = None,
     title: str = "jaxsr evaluation",
     meta: Mapping[str, Any] | None = None,
     progress: Progress,
@@ -100,6 +94,7 @@ def evaluate(
         places: sequences, or folders of sequences.
         methods: names, or files of weights, as for `find_method`.
         frames: numbers of the first and the last frame; all by default.
+        truth: "reference" or "color"; by default the best that all frames of all sequences have.
         meta: shown on the page and kept with the numbers.
         progress: told of each frame that is made and measured.
 
@@ -107,13 +102,14 @@ def evaluate(
         One result per sequence; `rich_tables` prints them.
 
     Raises:
-        JaxsrError: see `find_sequences`, `find_methods`, `part`, `check_needs`, `run_methods`.
+        JaxsrError: see `find_sequences`, `find_methods`, `part`, `choose_truth`, `check_needs`, `run_methods`.
     """
     check_results_folder(out)
     loaded = find_methods(methods, settings.scale)
     paths = find_sequences(places)
     names = labels(paths)
     sequences = [part(FrameSequence.open(path), frames) for path in paths]
+    truth = choose_truth(sequences, truth)
     for sequence in sequences:
         _check(sequence, loaded, settings)
     for name, sequence in zip(names, sequences, strict=True):
@@ -122,7 +118,7 @@ def evaluate(
     compiled: dict[Any, float] = {}
     sections = [
         run_methods(
-            Evaluation(sequence, settings, Reference(sequence, in_regions=True), advance, name),
+            Evaluation(sequence, settings, Reference(sequence, in_regions=True, truth=truth), advance, name),
             loaded,
             out / name,
             compiled=compiled,
@@ -131,6 +127,7 @@ def evaluate(
         for name, sequence in zip(names, sequences, strict=True)
     ]
     advance = progress("page", 1)
+    meta = {**(meta or {}), "truth": truth}
     write_metrics(out, sections, title=title, meta=meta)
     write_report(out / "report.html", sections, title=title, meta=meta)
     advance()

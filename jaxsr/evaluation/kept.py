@@ -119,6 +119,7 @@ def _key(evaluation: Evaluation, loaded: LoadedMethod) -> dict[str, Any] | None:
         "frames": [info.index for info in sequence.infos],
         "settings": settings._replace(metrics=settings.metrics or available())._asdict(),
         "regions": evaluation.reference.in_regions,
+        "truth": evaluation.reference.truth,
     }
 
 

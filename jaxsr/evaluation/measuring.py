@@ -9,6 +9,8 @@ import numpy as np
 
 from jaxsr.evaluation.regions import regions
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.io.truth import Truth as TruthLayer
+from jaxsr.io.truth import choose_truth
 from jaxsr.metrics import METRICS, available, flip_map, measure_frame
 from jaxsr.report.embedding import ImageOrPath, flip_jpeg
 from jaxsr.report.results import ALL, MethodResult
@@ -45,10 +47,16 @@ class Reference:
     Args:
         sequence: with HR colour, and for regions with an HR G-buffer.
         in_regions: whether edges and disocclusions are measured apart.
+        truth: "reference" or "color"; by default the best that all frames have.
+
+    Attributes:
+        truth: the name of the layer.
     """
 
-    def __init__(self, sequence: FrameSequence, in_regions: bool = False) -> None:
-        self.in_regions = in_regions
+    def __init__(
+        self, sequence: FrameSequence, in_regions: bool = False, truth: TruthLayer | None = None
+    ) -> None:
+        self.in_regions, self.truth = in_regions, choose_truth([sequence], truth)
         self._sequence = sequence
         width, height = sequence.size
         frames = int(CACHE_BYTES / (width * height * (3 * 4 + 2)))
@@ -62,7 +70,7 @@ class Reference:
     def _read(self, i: int) -> Truth:
         sequence = self._sequence
         masks = regions(self._frame(i), self._frame(i - 1) if i else None) if self.in_regions else {}
-        return Truth(display(sequence.truth(i), sequence.exposure_at(i)), masks)
+        return Truth(display(sequence.truth(i, self.truth), sequence.exposure_at(i)), masks)
 
 
 class Meter:

@@ -150,14 +150,19 @@ def run_methods(
     measured = range(settings.warmup, len(sequence))
     indices = [info.index for info in sequence.infos]
     return SequenceResult(
-        title=f"{evaluation.title or sequence.name}, {task}",
+        title=f"{evaluation.title or sequence.name}, {task}, against {TRUTH_WORDS[evaluation.reference.truth]}",
         frames=[indices[i] for i in measured],
         truths=[frame_path(out / "truth", "png", indices[i]) for i in measured],
         methods=results,
         inputs=[frame_path(out / "input", "png", indices[i]) if schedule[i] else None for i in measured],
         extrapolated=[not schedule[i] for i in measured] if settings.every > 1 else (),
         exposure=sequence.exposure,
-        meta={"scale": settings.scale, "every": settings.every, "sequence": sequence.name},
+        meta={
+            "scale": settings.scale,
+            "every": settings.every,
+            "sequence": sequence.name,
+            "truth": evaluation.reference.truth,
+        },
         task=task,
     )
 
@@ -175,6 +180,9 @@ def _write_truth_and_input(evaluation: Evaluation, out: Path) -> None:
             given = np.asarray(sequence.frame(i, settings.scale).color_linear)
             path = frame_path(out / "input", "png", info.index)
             write_png(path, display(given, sequence.exposure_at(i)))
+
+
+TRUTH_WORDS = {"reference": "the anti-aliased reference", "color": "the aliased truth"}
 
 
 def describe(settings: Settings) -> str:

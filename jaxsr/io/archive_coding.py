@@ -4,7 +4,7 @@ The output of `decode_frame` differs from the input of `encode_frame` by at most
 
 | layer | stored as | error |
 |---|---|---|
-| color | half float, mantissa rounded to `color_bits` | relative 2^-(color_bits + 1); negatives become 0 |
+| color, reference | half float, mantissa rounded to `color_bits` | relative 2^-(color_bits + 1); negatives become 0 |
 | depth | 16-bit logarithm between the image's extremes, 65535 for sky | relative (log range) / 131068 |
 | motion | difference from the camera's motion at that depth, in steps of 1/64 pixel | 1/128 pixel |
 | normal | octahedral, 8 bits per coordinate | 0.95 degrees |
@@ -38,6 +38,7 @@ CODES = {
     "depth": (1, "<u2"),
     "motion": (2, "<u4"),
     "color": (3, "<u2"),
+    "reference": (3, "<u2"),
     "normal": (2, "|u1"),
     "base_color": (3, "|u1"),
     "roughness": (1, "|u1"),
@@ -195,8 +196,9 @@ def encode_frame(
     codes: dict[str, np.ndarray] = {"depth": depth[..., None]}
     still = predicted_motion(restore_depth(depth, limits), info, before, jitter)
     codes["motion"] = np.rint((layers["motion"] - still) * MOTION_STEP).astype(np.int32).view(np.uint32)
-    if "color" in layers:
-        codes["color"] = quantise_color(layers["color"], color_bits)
+    for name in ("color", "reference"):
+        if name in layers:
+            codes[name] = quantise_color(layers[name], color_bits)
     if "normal" in layers:
         codes["normal"] = quantise_normal(layers["normal"])
     if "base_color" in layers:
@@ -294,8 +296,9 @@ def _restore(
     layers = {"depth": depth[..., None]}
     rest = np.ascontiguousarray(codes["motion"]).view(np.int32) / MOTION_STEP
     layers["motion"] = predicted_motion(depth, info, before, jitter) + rest
-    if "color" in codes:
-        layers["color"] = restore_color(codes["color"], notes["color_bits"])
+    for name in ("color", "reference"):
+        if name in codes:
+            layers[name] = restore_color(codes[name], notes["color_bits"])
     if "normal" in codes:
         layers["normal"] = restore_normal(codes["normal"], ~np.isfinite(depth))
     if "base_color" in codes:

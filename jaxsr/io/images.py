@@ -89,15 +89,18 @@ def _check_size(path: Path, found: tuple[int, int], expected: tuple[int, int] | 
         raise JaxsrError("the picture is too large", where=path, expected=limit, found=f"{w}x{h}")
 
 
-def read_color(path: str | Path, size: tuple[int, int] | None = None) -> Float[np.ndarray, "h w 3"]:
+def read_color(
+    path: str | Path, size: tuple[int, int] | None = None, layer: str = "color"
+) -> Float[np.ndarray, "h w 3"]:
     """Read a picture as scene-linear float32 RGB: OpenEXR as it is, PNG and JPEG through the sRGB curve.
 
-    Of an OpenEXR file the layer `color` is taken, or `R, G, B`, or Blender's `*.Combined`, or the only layer
+    Of an OpenEXR file the layer of that name is taken, or `R, G, B`, or Blender's `*.Combined`, or the only layer
     with R, G and B.
 
     Args:
         path: the file.
         size: the height and width that it must have; compared before any pixel is decoded.
+        layer: the first choice of an OpenEXR file.
 
     Raises:
         JaxsrError: unknown extension, unreadable file, another size, no colour layer or several that could be
@@ -113,7 +116,7 @@ def read_color(path: str | Path, size: tuple[int, int] | None = None) -> Float[n
     prefixes = [n[:-1] for n in channels if n.endswith("R") and n[-2:-1] in ("", ".")]
     whole = [p for p in prefixes if f"{p}G" in channels and f"{p}B" in channels]
     named = [p for p in whole if p in ("color.", "") or p.endswith("Combined.")]
-    chosen = "color." if "color." in whole else (named or whole)
+    chosen = f"{layer}." if f"{layer}." in whole else (named or whole)
     if not isinstance(chosen, str):
         if len(chosen) != 1:
             raise JaxsrError(

@@ -145,13 +145,17 @@ class Sequence:
             factor=Scale(scale),
         )
 
-    def truth(self, i: int) -> Float[np.ndarray, "H W 3"]:
-        """The HR colour, scene-linear. Nothing else is read.
+    def truth(self, i: int, layer: str = "color") -> Float[np.ndarray, "H W 3"]:
+        """An HR colour, scene-linear and not jittered. Nothing else is read.
+
+        Args:
+            layer: "color", sampled at the centres of pixels, or "reference", anti-aliased.
 
         Raises:
             JaxsrError: the sequence, or this frame, has none.
         """
-        return self.lr_color(i, 1)
+        only = frozenset({layer})
+        return self._read(i, self._resolution("hr"), only, only)[layer]
 
     def lr_color(self, i: int, scale: int) -> Float[np.ndarray, "h w 3"]:
         """The LR colour, scene-linear and jittered; at scale 1 the HR colour. Nothing else is read.

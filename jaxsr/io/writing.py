@@ -256,7 +256,7 @@ class SequenceWriter:
             if layer in self.round_bits:
                 stored = round_mantissa(stored, self.round_bits[layer])
             if kind == "half":
-                if layer == "color":  # a lamp seen directly: brighter than any tone map shows
+                if layer in ("color", "reference"):  # a lamp seen directly: brighter than any tone map shows
                     stored = stored.clip(-HALF_MAX, HALF_MAX)
                 stored = stored.astype(np.float16)
         fits = np.isinf(stored) == np.isinf(x)

@@ -16,6 +16,7 @@ from jaxsr.data.loader import check_crop
 from jaxsr.errors import JaxsrError
 from jaxsr.files import read_json, write_text
 from jaxsr.io.sequence import Sequence
+from jaxsr.io.truth import TRUTHS
 from jaxsr.methods import Method
 from jaxsr.provenance import changes, provenance
 from jaxsr.training.initial import hashes, same_hashes
@@ -39,6 +40,9 @@ class TrainConfig:
     """Folder for converted sequences; ~/.cache/jaxsr by default."""
     scale: int = 4
     """HR size over LR size."""
+    truth: Literal["reference", "color", "best"] = "best"
+    """HR colour to train on: "reference" is anti-aliased, "color" is not. "best": the reference where all
+    frames have one."""
     steps: int = 500
     """Updates of the weights."""
     batch: int = 8
@@ -87,6 +91,7 @@ class TrainConfig:
         _check("learning_rate", math.isfinite(rate) and rate > 0, "a number above 0", rate)
         _check("clip_norm", math.isfinite(clip) and clip >= 0, "0, or a number above it", clip)
         _check("ema", 0 <= ema < 1, "a number from 0, below 1", ema)
+        _check("truth", self.truth in (*TRUTHS, "best"), "reference, color or best", self.truth)
         for name, kind in (("schedule", Schedule), ("best_by", Score)):
             choices = get_args(kind)
             _check(name, getattr(self, name) in choices, " | ".join(choices), getattr(self, name))
@@ -184,7 +189,8 @@ def enter(out: Path, new: dict[str, Any]) -> list[str]:
 def differences(old: dict[str, Any], new: dict[str, Any]) -> list[str]:
     """ "field: old -> new" for all that may not differ when a training is resumed."""
 
-    defaults = _json(TrainConfig())  # of options that did not exist when an old training began
+    # Of options that did not exist when an old training began; the only truth then was the colour.
+    defaults = _json(dataclasses.replace(TrainConfig(), truth="color"))
 
     def flat(record: dict[str, Any]) -> dict[str, Any]:
         kept = {k: v for k, v in (defaults | record["config"]).items() if k not in MAY_CHANGE}

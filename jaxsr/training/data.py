@@ -15,6 +15,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.frames import Window
 from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence
+from jaxsr.io.truth import Truth, choose_truth
 from jaxsr.methods import Method
 from jaxsr.progress import Bars
 from jaxsr.training.config import TrainConfig, identity
@@ -26,6 +27,8 @@ class Data(NamedTuple):
 
     loader: Loader
     evaluate: Evaluator
+    truth: Truth
+    """The layer that both have as their truth."""
 
 
 def open_data(method: Method, config: TrainConfig, *, quiet: bool = False) -> Data:
@@ -51,12 +54,14 @@ def open_data(method: Method, config: TrainConfig, *, quiet: bool = False) -> Da
         else:
             evaluated, held_back = trained, held_back_frames(windows)
             _check_lengths(trained, windows.length, held_back)
-        shared: Any = {"scale": config.scale, "cache": config.cache, "progress": progress}
+        wanted = None if config.truth == "best" else config.truth
+        truth = choose_truth([Sequence.open(path) for path in (*trained, *evaluated)], wanted)
+        shared: Any = {"scale": config.scale, "truth": truth, "cache": config.cache, "progress": progress}
         measured = WindowSource(evaluated, method.needs, evaluation_windows(windows), **shared)
         source = WindowSource(trained, method.needs, windows, held_back=held_back, **shared)
     evaluate = Evaluator(method, measured, last_only=not config.eval_data)
     stream = Stream(batch=config.batch, crop=config.crop, flips=config.flips, seed=config.seed)
-    return Data(Loader(source, stream), evaluate)
+    return Data(Loader(source, stream), evaluate, truth)
 
 
 def batches(loader: Loader, sharding: NamedSharding) -> Iterator[tuple[Window, dict[str, Any]]]:

@@ -7,6 +7,7 @@ training that was stopped and resumed has in common with one that was not.
 import contextlib
 import math
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -63,7 +64,8 @@ def train(
     notes: list[str] = []
     if not has_checkpoints(config.out):
         weights, notes = initial_weights(method, config.init, config.scale)
-    loader, evaluate = open_data(method, config, quiet=quiet)
+    loader, evaluate, truth = open_data(method, config, quiet=quiet)
+    config = replace(config, truth=truth)
     record = describe(method, config, loader.sequences, evaluate.sequences)
     notes += enter(config.out, record)
 

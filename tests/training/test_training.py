@@ -324,7 +324,7 @@ def test_the_sample_is_the_default(tmp_path):
 
 def test_the_last_frame_is_held_back(data):
     config = TrainConfig(data=(data,), cache=data.parent / "cache", scale=2, crop=16)
-    loader, evaluate = open_data(tiny_method.method(), config, quiet=True)
+    loader, evaluate, _ = open_data(tiny_method.method(), config, quiet=True)
     loader.close()
     assert loader.windows == 4
     assert evaluate.frames == "clip 5, held back from training"
