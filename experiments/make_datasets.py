@@ -8,7 +8,8 @@
 
 Sequences lie at `DIR/<set>/<scene>-<split>-<clip>`. `render` and `unpack` look for an archive (`*.jsrz`) in
 `--search`, then in `../shared/datasets` beside the repository, and never render what an archive holds; both
-resume. `floor` works clip by clip and measures every clip again; `card` and `pack` start from the beginning.
+resume. Files `reference/<set>/<clip>/<frame>.exr` beside an archive are joined to sequences that have no
+reference of their own. `floor` works clip by clip and measures every clip again; `card` and `pack` start from the beginning.
 Training and test clips have camera paths and scene layouts of their own: they share no frames. All is
 deterministic for a seed, whatever the number of threads.
 """
@@ -19,7 +20,7 @@ import os
 import sys
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -39,6 +40,7 @@ from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.files import atomic_path  # noqa: E402
 from jaxsr.io.archive import pack, read_manifest, unpack_sequence, verify  # noqa: E402
 from jaxsr.io.exr import read_exr  # noqa: E402
+from jaxsr.io.images import read_color  # noqa: E402
 from jaxsr.io.sequence import Sequence  # noqa: E402
 from jaxsr.ops.color import to_display  # noqa: E402
 from jaxsr.progress import Bar, Bars  # noqa: E402
@@ -46,6 +48,8 @@ from jaxsr.provenance import commit, machine  # noqa: E402
 
 SCENES = ("bunker", "forest", "docks")
 CLIP_FRAMES = 12
+REFERENCE_SAMPLES = {"bunker": (24, 64, 128), "docks": (32, 64, 128), "forest": (16, 48, 96)}
+"""Samples per pixel of the reference: of training clips, of the test set, of the sample's test clips."""
 LICENSE = "CC0-1.0"
 FLOORS = ROOT / "experiments" / "results" / "noise_floor.json"
 CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "jaxsr" / "datasets"
@@ -193,9 +197,32 @@ def from_archive(config: Render, clip: Clip, folder: Path) -> bool:
             continue
         if not _same_render(head["generator"], config):
             continue
-        unpack_sequence(archive, manifest, name, folder)
+        unpack_sequence(archive, manifest, name, folder, find_references(archive, name, head))
         return True
     return False
+
+
+def find_references(
+    archive: Path, name: str, head: Mapping[str, Any]
+) -> Callable[[int], dict[str, np.ndarray]] | None:
+    """Reader of `reference/<name>/<frame>.exr` beside an archive that was made without this layer.
+
+    Returns:
+        Index of a frame -> the layer; None where it is not there for all frames.
+    """
+    folder = archive.parent / "reference" / name
+    if not all((folder / f"{frame['index']:04d}.exr").is_file() for frame in head["frames"]):
+        return None
+
+    def read(index: int) -> dict[str, np.ndarray]:
+        return {"reference": read_color(folder / f"{index:04d}.exr", layer="reference")}
+
+    return read
+
+
+def reference_kind(config: Render, clip: Clip) -> int:
+    """Column of `REFERENCE_SAMPLES`: training, test set, or the test clips of the sample."""
+    return 0 if clip.split == "train" else 2 if config.set == "sample" else 1
 
 
 def size_of(config: Render) -> tuple[int, int]:
@@ -249,6 +276,7 @@ def _render_clip(config: Render, clip: Clip, folder: Path, deadline: float, bar:
             config.scales,
             size=size_of(config),
             samples=config.samples,
+            reference_samples=config.samples or REFERENCE_SAMPLES[clip.scene][reference_kind(config, clip)],
             seed=config.seed,
             threads=config.threads,
             name=clip.name,
@@ -389,7 +417,8 @@ def unpack_set(config: Unpack, bars: Bars) -> None:
         verify(archive)
         bar = bars.start("unpack", len(manifest["sequences"]), unit="sequence")
         for name in manifest["sequences"]:
-            unpack_sequence(archive, manifest, name, config.out / name)
+            references = find_references(archive, name, manifest["sequences"][name])
+            unpack_sequence(archive, manifest, name, config.out / name, references)
             bar.update(bar.done + 1, name)
 
 

@@ -104,8 +104,8 @@ def compare(
         fps: the speed at which the page plays at first, in frames per second.
         lpips: also measure LPIPS, if the extra `perceptual` is installed; this takes most of the time.
         lpips_alex: also measure LPIPS with AlexNet, which no training loss uses.
-        layer: the layer of a truth that is a sequence: `reference`, which is anti-aliased, or `color`, which is
-            not. The default is the reference if all frames have one.
+        layer: the layer of a truth that is a sequence: `reference`, which is anti-aliased, or `color`, which
+            is not. The default is the reference if all frames have one.
     """
     from rich.console import Console
 

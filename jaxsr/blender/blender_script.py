@@ -15,8 +15,8 @@ also in the middle of a render.
 
 Writes `scene.json`, `0001.json` (cameras of frames f and f - 1, without jitter) and `0001_hr_color.exr`,
 `0001_hr_gbuffer.exr`, `0001_hr_reference.exr`, `0001_x2_color.exr`, ... Each is written under a temporary
-name and renamed; files that exist are not rendered again. stdout carries one JSON object a line: {"event": "scene" | "render" | "frame" |
-"done" | "error", ...}; what Blender prints goes to stderr.
+name and renamed; files that exist are not rendered again. stdout carries one JSON object per line:
+{"event": "scene" | "render" | "frame" | "done" | "error", ...}; what Blender prints goes to stderr.
 
 Rendering: Cycles on the CPU, no anti-aliasing (all samples of a pixel within 0.005 pixels of its centre), no
 motion blur, no depth of field, no compositing. The G-buffer is a render of its own at one sample. The

@@ -135,7 +135,9 @@ def labels(folders: Sequence[Path]) -> list[str]:
 
 
 def read_display(path: Path, exposure: float, layer: str = "color") -> np.ndarray:
-    """A frame as display-referred float32 [H, W, 3] in [0, 1]; `layer` is the first choice of an OpenEXR file.
+    """A frame as display-referred float32 [H, W, 3] in [0, 1].
+
+    Of an OpenEXR file `layer` is the first choice.
 
     Raises:
         JaxsrError: unreadable or truncated file, no colour in it, NaN or infinity.
@@ -204,7 +206,7 @@ def compare(
         out: where the results go; made if it is not there.
         exposure: factor on linear colour before the tone map; by default that of the truth if it is a
             sequence, else 1.
-        layer: of a truth that is a sequence; by default the reference if all frames have one, else the colour.
+        layer: of a truth that is a sequence; by default the reference if all frames have one.
         fps: speed at which the page plays at first.
         meta: shown on the page and kept with the numbers.
         max_megabytes: aim for the size of the page.

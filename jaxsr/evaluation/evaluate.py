@@ -102,7 +102,8 @@ def evaluate(
         One result per sequence; `rich_tables` prints them.
 
     Raises:
-        JaxsrError: see `find_sequences`, `find_methods`, `part`, `choose_truth`, `check_needs`, `run_methods`.
+        JaxsrError: see `find_sequences`, `find_methods`, `part`, `choose_truth`, `check_needs` and
+            `run_methods`.
     """
     check_results_folder(out)
     loaded = find_methods(methods, settings.scale)

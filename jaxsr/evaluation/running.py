@@ -149,8 +149,9 @@ def run_methods(
     task, schedule = describe(settings), rendered_schedule(sequence, settings.every)
     measured = range(settings.warmup, len(sequence))
     indices = [info.index for info in sequence.infos]
+    truth = TRUTH_WORDS[evaluation.reference.truth]
     return SequenceResult(
-        title=f"{evaluation.title or sequence.name}, {task}, against {TRUTH_WORDS[evaluation.reference.truth]}",
+        title=f"{evaluation.title or sequence.name}, {task}, against {truth}",
         frames=[indices[i] for i in measured],
         truths=[frame_path(out / "truth", "png", indices[i]) for i in measured],
         methods=results,

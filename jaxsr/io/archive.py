@@ -218,8 +218,21 @@ def verify(archive: Path) -> None:
         raise JaxsrError("the checksum does not match", where=archive, expected=f"that of {beside.name}")
 
 
-def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folder: Path) -> Path:
+def unpack_sequence(
+    archive: Path,
+    manifest: Mapping[str, Any],
+    name: str,
+    folder: Path,
+    more: Callable[[int], Mapping[str, np.ndarray]] | None = None,
+) -> Path:
     """Write one sequence of the archive to a folder; resumes.
+
+    Args:
+        archive: the file.
+        manifest: of it (`read_manifest`).
+        name: of the sequence in the archive.
+        folder: to write.
+        more: index of a frame -> further HR layers, which lie beside the archive.
 
     Raises:
         JaxsrError: a member is missing or damaged.
@@ -257,6 +270,8 @@ def unpack_sequence(archive: Path, manifest: Mapping[str, Any], name: str, folde
             )
             if len(images[info.index]) == len(writer.resolutions):
                 done = images.pop(info.index)
+                if more is not None and "hr" in done:
+                    done["hr"] |= more(info.index)
                 writer.write_frame(info, done.pop("hr", None), {int(r[1:]): x for r, x in done.items()})
     writer.close()
     return folder

@@ -4,7 +4,7 @@ The output of `decode_frame` differs from the input of `encode_frame` by at most
 
 | layer | stored as | error |
 |---|---|---|
-| color, reference | half float, mantissa rounded to `color_bits` | relative 2^-(color_bits + 1); negatives become 0 |
+| color, reference | half float, mantissa of `color_bits` | relative 2^-(color_bits + 1); negatives become 0 |
 | depth | 16-bit logarithm between the image's extremes, 65535 for sky | relative (log range) / 131068 |
 | motion | difference from the camera's motion at that depth, in steps of 1/64 pixel | 1/128 pixel |
 | normal | octahedral, 8 bits per coordinate | 0.95 degrees |

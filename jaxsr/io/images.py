@@ -94,8 +94,8 @@ def read_color(
 ) -> Float[np.ndarray, "h w 3"]:
     """Read a picture as scene-linear float32 RGB: OpenEXR as it is, PNG and JPEG through the sRGB curve.
 
-    Of an OpenEXR file the layer of that name is taken, or `R, G, B`, or Blender's `*.Combined`, or the only layer
-    with R, G and B.
+    Of an OpenEXR file the layer of that name is taken, or `R, G, B`, or Blender's `*.Combined`, or the only
+    layer with R, G and B.
 
     Args:
         path: the file.
