@@ -9,9 +9,9 @@
 Sequences lie at `DIR/<set>/<scene>-<split>-<clip>`. `render` and `unpack` look for an archive (`*.jsrz`) in
 `--search`, then in `../shared/datasets` beside the repository, and never render what an archive holds; both
 resume. Files `reference/<set>/<clip>/<frame>.exr` beside an archive are joined to sequences that have no
-reference of their own. `floor` works clip by clip and measures every clip again; `card` and `pack` start from the beginning.
-Training and test clips have camera paths and scene layouts of their own: they share no frames. All is
-deterministic for a seed, whatever the number of threads.
+reference of their own. `floor` works clip by clip and measures every clip again; `card` and `pack` start from
+the beginning. Training and test clips have camera paths and scene layouts of their own: they share no frames.
+All is deterministic for a seed, whatever the number of threads.
 """
 
 import json

@@ -135,7 +135,7 @@ def render(
             "blender": described["blender"],
             "seed": seed,
             **{key: described[key] for key in ("samples", "adaptive", "denoise", "bounces")},
-            **({"reference_samples": described["reference"]} if described["reference"] else {}),
+            **({"reference_samples": described.get("reference", 0)} if described.get("reference", 0) else {}),
         }
         writer = SequenceWriter(
             out,
@@ -271,8 +271,8 @@ class _Reporter:
         # A G-buffer costs about as much as two samples of colour (measured on three scenes).
         cost = {"color": described["samples"] + 0.5, "gbuffer": 2.0}
         work = {("hr" if s == 1 else f"x{s}", k): c / s**2 for s in (1, *scales) for k, c in cost.items()}
-        if described["reference"]:
-            work["hr", "reference"] = described["reference"] + 0.5
+        if described.get("reference", 0):
+            work["hr", "reference"] = described.get("reference", 0) + 0.5
         self.share = {key: value / sum(work.values()) for key, value in work.items()}
 
     def __call__(self, event: Mapping[str, Any]) -> None:

@@ -1,7 +1,7 @@
 """The rendered sample that ships with the package: three scenes, a test and a training clip of each.
 
-It is stored as one archive per scene (`jaxsr.io.archive`), since OpenEXR would take several times the space,
-and is unpacked to ordinary sequences where it is used. docs/data_card.md describes it.
+It is stored as one archive per scene and split (`jaxsr.io.archive`), since OpenEXR would take several times
+the space, and is unpacked to ordinary sequences where it is used. docs/data_card.md describes it.
 """
 
 import hashlib
@@ -16,6 +16,8 @@ from jaxsr.io.archive import read_manifest, unpack_sequence
 from jaxsr.io.sequence import Sequence
 from jaxsr.progress import Progress, silent
 
+SPLITS = ("test", "train")
+
 
 def sample_folder() -> Path:
     """The folder of the archives inside the package."""
@@ -28,7 +30,7 @@ def sample_scenes() -> list[str]:
     Raises:
         JaxsrError: the package was installed without its sample.
     """
-    scenes = sorted(path.stem for path in sample_folder().glob("*.jsrz"))
+    scenes = sorted({path.stem.rpartition("-")[0] for path in sample_folder().glob("*.jsrz")})
     if not scenes:
         raise JaxsrError("the sample is missing", where=sample_folder(), fix="reinstall jaxsr")
     return scenes
@@ -64,11 +66,13 @@ def unpack_sample(
         raise JaxsrError(f"no scene {unknown[0]!r} in the sample", expected=", ".join(known))
     found = []
     for scene in dict.fromkeys(scenes or known):
-        archive = sample_folder() / f"{scene}.jsrz"
+        archive = sample_folder() / f"{scene}-{split}.jsrz"
+        if not archive.is_file():
+            raise JaxsrError(
+                "no such part of the sample", where="split", expected=" or ".join(SPLITS), found=split
+            )
         manifest = read_manifest(archive)
-        found += [(archive, manifest, n) for n in manifest["sequences"] if f"-{split}-" in n]
-    if not found:
-        raise JaxsrError("no such part of the sample", where="split", expected="test or train", found=split)
+        found += [(archive, manifest, name) for name in manifest["sequences"]]
     for archive, manifest, name in found:
         scales = manifest["sequences"][name]["scales"]
         if scale is not None and scale not in scales:

@@ -44,7 +44,7 @@ def test_arrays_are_the_layers_of_the_files(tmp_path):
     seq = make_sequence(tmp_path / "s", **SMALL, precision={"motion": "half", "object_id": "uint"})
     found = open_arrays(seq.path, ("hr", "x2"), cache=tmp_path / "cache")
     for resolution, arrays in found.items():
-        assert set(arrays.layers) == set(LAYERS) - {"position"}
+        assert set(arrays.layers) == set(LAYERS) - {"position", "reference"}
         for layer, pixels in arrays.layers.items():
             expected = np.stack([seq.stored(i, resolution)[layer] for i in range(3)])
             assert pixels.dtype == expected.dtype

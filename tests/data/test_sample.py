@@ -12,23 +12,27 @@ from jaxsr.data import sample
 from jaxsr.errors import JaxsrError
 from jaxsr.io.archive import pack, read_manifest, verify
 from jaxsr.io.sequence import Sequence
+from jaxsr.metrics import psnr
+from jaxsr.ops import to_display
 from tests.builders import make_sequence
 
 SCENES = ["bunker", "docks", "forest"]
 
 
-def test_three_scenes_in_at_most_25_megabytes():
+def test_three_scenes_in_at_most_40_megabytes():
     assert sample.sample_scenes() == SCENES
-    files = [sample.sample_folder() / f"{scene}.jsrz" for scene in SCENES]
-    assert sum(f.stat().st_size for f in files) < 25e6
+    files = [sample.sample_folder() / f"{scene}-{split}.jsrz" for scene in SCENES for split in sample.SPLITS]
+    assert sum(f.stat().st_size for f in files) < 40e6
     assert max(f.stat().st_size for f in files) < 10e6
 
 
 @pytest.mark.parametrize("scene", SCENES)
 def test_archives_are_whole_and_hold_test_and_training_frames(scene):
-    archive = sample.sample_folder() / f"{scene}.jsrz"
-    verify(archive)
-    heads = {name.split("/")[-1]: head for name, head in read_manifest(archive)["sequences"].items()}
+    heads = {}
+    for split in sample.SPLITS:
+        archive = sample.sample_folder() / f"{scene}-{split}.jsrz"
+        verify(archive)
+        heads |= {name.split("/")[-1]: head for name, head in read_manifest(archive)["sequences"].items()}
     assert sorted(heads) == [f"{scene}-test-0", f"{scene}-train-0"]
     test, train = heads[f"{scene}-test-0"], heads[f"{scene}-train-0"]
     assert len(test["frames"]) == 8
@@ -53,6 +57,11 @@ def test_a_sequence_of_the_sample_reads_as_any_other(tmp_path):
     truth = sequence.truth(1)
     assert np.isfinite(truth).all()
     assert truth.mean() > 0.05
+    smooth = sequence.truth(1, "reference")
+    assert np.isfinite(smooth).all()
+    shown, pixels = (np.asarray(to_display(x, sequence.exposure)) for x in (smooth, truth))
+    assert 18 < psnr(pixels, shown) < 30  # the same picture, without its aliasing
+    assert np.abs(np.diff(shown, axis=1)).mean() < np.abs(np.diff(pixels, axis=1)).mean()
     files = sorted(p.stat().st_mtime_ns for p in folder.rglob("*.exr"))
     assert sample.unpack_sample(tmp_path, "train", ("docks",)) == [folder]  # kept, not written again
     assert sorted(p.stat().st_mtime_ns for p in folder.rglob("*.exr")) == files
@@ -99,7 +108,7 @@ print([os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) for child in children]
 def tiny(tmp_path, monkeypatch):
     """The folder of a sample of one tiny scene, which is used in place of the real one."""
     sequence = make_sequence(tmp_path / "tiny-train-0", size=(16, 12), frames=4, scales=(2,))
-    pack({"train/tiny-train-0": sequence.path}, tmp_path / "archives" / "tiny.jsrz")
+    pack({"train/tiny-train-0": sequence.path}, tmp_path / "archives" / "tiny-train.jsrz")
     monkeypatch.setattr(sample, "sample_folder", lambda: tmp_path / "archives")
     return tmp_path / "archives"
 

@@ -72,7 +72,9 @@ def done(data, tmp_path_factory):
 
 def test_it_writes_frames_numbers_and_a_page(done):
     out, sections, steps = done
-    assert [s.title for s in sections] == ["one, x2, super-resolution", "two, x2, super-resolution"]
+    assert [s.title for s in sections] == [
+        f"{name}, x2, super-resolution, against the aliased truth" for name in ("one", "two")
+    ]
     assert [s for s in steps if s[0] == "frames"] == [("frames", 2 * 2 * 7)] * (2 * 2 * 7)
     for name, count in (("one", 3), ("two", 4)):
         for method in ("bilinear", "net"):

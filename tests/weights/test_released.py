@@ -136,7 +136,7 @@ def clip(scene):
     """The first two frames of a scene's test clip, as a sequence; unpacked once."""
     folder = tempfile.TemporaryDirectory()
     atexit.register(folder.cleanup)
-    archive = sample_folder() / f"{scene}.jsrz"
+    archive = sample_folder() / f"{scene}-test.jsrz"
     manifest, name = read_manifest(archive), f"sample/{scene}-test-0"
     head = manifest["sequences"][name]
     manifest["sequences"][name] = head | {"frames": head["frames"][:2]}
