@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 from jaxsr.errors import JaxsrError
-from jaxsr.methods import fusion_sr, guided, guided_taau, interpolation, nsrr, rcan, rrn, taau
+from jaxsr.methods import fusion_sr, guided, guided_taau, guided_unet, interpolation, nsrr, rcan, rrn, taau
 from jaxsr.methods.base import Method, Needs, Network, Windows, last_frames, module_maker
 from jaxsr.methods.image_loss import ImageLoss, L1Loss
 from jaxsr.methods.options import NoOptions, from_json, to_json
@@ -23,6 +23,7 @@ class Learned(NamedTuple):
 
 LEARNED: dict[str, Learned] = {
     "fusion-sr": Learned(fusion_sr.Options, ImageLoss, fusion_sr.method),
+    "guided-unet": Learned(guided_unet.Options, guided_unet.Loss, guided_unet.method),
     "rcan": Learned(rcan.Options, L1Loss, rcan.method),
     "rrn": Learned(rrn.Options, rrn.Loss, rrn.method),
     "nsrr": Learned(nsrr.Options, ImageLoss, nsrr.method),

@@ -81,7 +81,7 @@ def test_it_writes_frames_numbers_and_a_page(done):
             assert len(list((out / name / method / "exr").iterdir())) == count
             assert len(list((out / name / method / "png").iterdir())) == count
     data = json.loads((out / "metrics.json").read_text())
-    assert data["meta"] == {"seed": 1}
+    assert data["meta"] == {"seed": 1, "truth": "color"}
     net = data["sections"][0]["tracks"][1]
     assert net["name"] == "net"
     assert net["cost"]["parameters"] > 1e5

@@ -1,0 +1,5 @@
+"""`python -m jaxsr`."""
+
+from jaxsr.cli import main
+
+main()
