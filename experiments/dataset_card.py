@@ -1,6 +1,7 @@
 """Writes docs/data_card.md from the sequences on disk and the measured noise floors."""
 
 import json
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -28,10 +29,20 @@ no textures or models from elsewhere. Licence of all pictures: {license}.
 
 ## What a frame holds
 
-HR colour (the truth) and HR G-buffer without jitter; LR colour and LR G-buffer at each scale, jittered by
-Halton (2, 3) of length 32. The G-buffer: linear depth, backward motion, world normal, base colour, roughness,
-metallic, object id. All are point samples at pixel centres: no anti-aliasing, motion blur, depth of field or
-tone mapping. The G-buffer is a render of its own at one sample per pixel; colour has the samples below.
+HR colour (a truth, aliased) and HR G-buffer without jitter; LR colour and LR G-buffer at each scale,
+jittered by Halton (2, 3) of length 32. The G-buffer: linear depth, backward motion, world normal, base
+colour, roughness, metallic, object id. All are point samples at pixel centres: no anti-aliasing, motion blur,
+depth of field or tone mapping. The G-buffer is a render of its own at one sample per pixel; colour has the
+samples below.
+
+The `reference` is the other truth: HR colour of the same scene, frame and camera, without jitter,
+anti-aliased by a Blackman-Harris filter (1.5 pixels in Blender, which is a support of 3 pixels), and denoised
+where the colour is. Its samples per
+pixel:
+
+| scene | training clips | test set | test clips of the sample |
+|---|---|---|---|
+{references}
 
 ## Sequences
 
@@ -40,16 +51,20 @@ tone mapping. The G-buffer is a render of its own at one sample per pixel; colou
 {rows}
 
 Total: {frames} frames, {megabytes:.1f} MB, {cpu:.0f} CPU seconds{note}. Blender {blender}.
+The script can render two more training clips of each scene (3 and 4), which the archives do not hold.
 Training and test clips have camera paths, scene seeds and layouts of their own: they share no frames.
 
-## Noise of the truth
+## Noise of the two truths
 
 Two renders with different seeds; PSNR of display-referred colour with half their mean squared difference,
 which estimates one render's distance from the noiseless image. For denoised clips the bias of the denoiser,
 which both renders share, is not in it. Differences between methods near or above this number mean nothing.
+The samples of a pixel of the reference are spread over more than a pixel, so it needs more of them than the
+colour for the same noise. It is measured as the sample has it; the test set has fewer samples in its
+references (see above), and its floor was not measured.
 
-| clip | samples | floor (dB) | frames | size |
-|---|---|---|---|---|
+| truth | clip | samples | floor (dB) | by frame | size |
+|---|---|---|---|---|---|
 {floors}
 
 ## Limits
@@ -77,8 +92,25 @@ def _strip(sequences: list[Sequence], path: Path, width: int = 256) -> None:
     write_png(path, np.concatenate([x[: min(s.shape[0] for s in shown)] for x in shown], 1))
 
 
-def write(out: Path, floors: Path, docs: Path) -> Path:
+def floor_rows(measured: dict[str, dict[str, Any]]) -> list[str]:
+    """Lines of the table of noise, from what `make_datasets.py floor` measured: by truth, then by clip."""
+    return [
+        f"| {truth} | {clip} | {e['samples']} | {e['psnr_db']} | "
+        + ", ".join(f"{f}: {db}" for f, db in e["frames"].items())
+        + f" | {e['size'][0]}x{e['size'][1]} |"
+        for truth, clips in measured.items()
+        for clip, e in clips.items()
+    ]
+
+
+def write(out: Path, floors: Path, docs: Path, references: Mapping[str, Iterable[int]]) -> Path:
     """Write the card and its pictures; returns its path.
+
+    Args:
+        out: the folder of the sets.
+        floors: the file that `make_datasets.py floor` wrote.
+        docs: the folder of the card.
+        references: samples per pixel of the references of each scene, in the order of their table.
 
     Raises:
         JaxsrError: no sequences below `out`.
@@ -110,12 +142,6 @@ def write(out: Path, floors: Path, docs: Path) -> Path:
         _strip(list(scenes.values()), picture)
         pictures.append(f"![{', '.join(scenes)}: {split} clips](images/{picture.name})")
     measured = json.loads(floors.read_text()) if floors.is_file() else {}
-    lines = [
-        f"| {clip} | {e['samples']} | {e['psnr_db']} | "
-        + ", ".join(f"{f}: {db}" for f, db in e["frames"].items())
-        + f" | {e['size'][0]}x{e['size'][1]} |"
-        for clip, e in measured.items()
-    ]
     text = _TEXT.format(
         license=", ".join(sorted(licenses)),
         pictures="\n\n".join(pictures),
@@ -125,7 +151,8 @@ def write(out: Path, floors: Path, docs: Path) -> Path:
         cpu=cpu,
         note=f" ({unknown} sequences came from an archive, without their cost)" if unknown else "",
         blender=", ".join(sorted(versions)),
-        floors="\n".join(lines) or "| not measured | | | | |",
+        references="\n".join(f"| {s} | {' | '.join(map(str, n))} |" for s, n in references.items()),
+        floors="\n".join(floor_rows(measured)) or "| not measured | | | | | |",
     )
     path = docs / "data_card.md"
     with atomic_path(path) as temporary:

@@ -42,6 +42,7 @@ from jaxsr.io.archive import pack, read_manifest, unpack_sequence, verify  # noq
 from jaxsr.io.exr import read_exr  # noqa: E402
 from jaxsr.io.images import read_color  # noqa: E402
 from jaxsr.io.sequence import Sequence  # noqa: E402
+from jaxsr.io.truth import TRUTHS, Truth  # noqa: E402
 from jaxsr.ops.color import to_display  # noqa: E402
 from jaxsr.progress import Bar, Bars  # noqa: E402
 from jaxsr.provenance import commit, machine  # noqa: E402
@@ -97,14 +98,16 @@ class Render:
 
 @dataclass(frozen=True)
 class Floor:
-    """Measure the truth's noise floor: two seeds, display-referred PSNR of half their squared difference."""
+    """Measure the noise floor of both truths: two seeds, display PSNR of half their squared difference."""
 
+    truths: tuple[Truth, ...] = TRUTHS
     scenes: tuple[str, ...] = SCENES
     splits: tuple[Literal["test", "train"], ...] = ("test", "train")
     clips: tuple[int, ...] = (0,)
     frames: tuple[int, ...] = (1, 6, 12)
     size: tuple[int, int] = (384, 216)
     samples: int | None = None
+    """Samples per pixel; the default is the number that the sample and the training set have."""
     seeds: tuple[int, int] = (101, 202)
     threads: int | None = None
     blender: Path | None = None
@@ -318,9 +321,9 @@ def floor_psnr(a: np.ndarray, b: np.ndarray, exposure: float) -> float:
 
 
 def _colors(
-    config: Floor, clip: Clip, seed: int, folder: Path, tick: Any
+    config: Floor, clip: Clip, truth: Truth, seed: int, folder: Path, tick: Any
 ) -> tuple[dict[int, np.ndarray], dict]:
-    """HR colour of the frames at one seed."""
+    """A truth of the frames at one seed."""
     arguments = {"seed": 0, "split": clip.split, "clip": clip.clip, "frames": CLIP_FRAMES}
     script = ROOT / "experiments" / "scenes" / f"{clip.scene}.py"
     job = {
@@ -328,49 +331,58 @@ def _colors(
         "frames": [min(config.frames), max(config.frames)],
         "skip": [f for f in range(min(config.frames), max(config.frames)) if f not in config.frames],
         "size": config.size, "scales": [], "samples": config.samples, "seed": seed, "threads": config.threads,
-        "jitter_px": [[0.0, 0.0]], "color_only": True, "attended": True, "out": str(folder),
+        "reference": config.samples or REFERENCE_SAMPLES[clip.scene][0 if clip.split == "train" else 2],
+        "jitter_px": [[0.0, 0.0]], "kinds": [truth], "attended": True, "out": str(folder),
     }  # fmt: skip
-    log = CACHE / "logs" / f"floor-{clip.name}-{seed}.log"
+    log = CACHE / "logs" / f"floor-{truth}-{clip.name}-{seed}.log"
     with BlenderProcess(find_blender(config.blender), job, folder, log) as process:
         described = process.scene()
         process.answer({})
         for event in process.events():
             if event["event"] == "render":
                 tick()
-    files = {f: folder / f"{f:04d}_hr_color.exr" for f in config.frames}
+    files = {f: folder / f"{f:04d}_hr_{truth}.exr" for f in config.frames}
     return {f: convert_color(read_exr(path)[0]) for f, path in files.items()}, described
 
 
 def measure_floor(config: Floor, bars: Bars) -> None:
-    """The verb `floor`: one entry per scene, split and clip in the results, replaced when measured again."""
+    """The verb `floor`: one entry per truth and clip in the results, replaced when measured again."""
     check_scenes(config.scenes)
     clips = [Clip(s, split, c, 12) for s in config.scenes for split in config.splits for c in config.clips]
-    bar = bars.start("floor", 2 * len(clips) * len(config.frames), unit="frame")
-    for clip in clips:
-        bar.update(bar.done, clip.name)
-        images = []
-        start = time.monotonic()
-        for seed in config.seeds:
-            with tempfile.TemporaryDirectory() as folder:
-                images.append(_colors(config, clip, seed, Path(folder), bar.advance))
-        (a, described), (b, _) = images
-        by_frame = {f: round(floor_psnr(a[f], b[f], described["exposure"]), 2) for f in config.frames}
-        mean_square = np.mean([10 ** (-psnr / 10) for psnr in by_frame.values()])
-        entry = {
-            "psnr_db": round(float(-10 * np.log10(mean_square)), 2),
-            "frames": by_frame,
-            "size": config.size,
-            **{key: described[key] for key in ("samples", "denoise", "bounces", "exposure", "blender")},
-            "scene_sha256": described["scene_sha256"],
-            "seeds": config.seeds,
-            "commit": commit(),
-            "device": machine(),
-            "seconds": round(time.monotonic() - start, 1),
-            "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        }
+    work = [(truth, clip) for truth in config.truths for clip in clips]
+    bar = bars.start("floor", 2 * len(work) * len(config.frames), unit="frame")
+    for truth, clip in work:
+        bar.update(bar.done, f"{clip.name}, {truth}")
+        entry = _floor_of(config, clip, truth, bar)
         old = json.loads(config.results.read_text()) if config.results.is_file() else {}
-        write_json(config.results, dict(sorted((old | {clip.name: entry}).items())))
-        bars.say(f"{clip.name}: {entry['psnr_db']} dB at {entry['samples']} samples")
+        old[truth] = dict(sorted((old.get(truth, {}) | {clip.name: entry}).items()))
+        write_json(config.results, old)
+        bars.say(f"{clip.name}, {truth}: {entry['psnr_db']} dB at {entry['samples']} samples")
+
+
+def _floor_of(config: Floor, clip: Clip, truth: Truth, bar: Bar) -> dict[str, Any]:
+    """What two renders of a truth say, and how they were made."""
+    images = []
+    start = time.monotonic()
+    for seed in config.seeds:
+        with tempfile.TemporaryDirectory() as folder:
+            images.append(_colors(config, clip, truth, seed, Path(folder), bar.advance))
+    (a, described), (b, _) = images
+    by_frame = {f: round(floor_psnr(a[f], b[f], described["exposure"]), 2) for f in config.frames}
+    mean_square = np.mean([10 ** (-psnr / 10) for psnr in by_frame.values()])
+    return {
+        "psnr_db": round(float(-10 * np.log10(mean_square)), 2),
+        "frames": by_frame,
+        "size": config.size,
+        "samples": described["reference" if truth == "reference" else "samples"],
+        **{key: described[key] for key in ("denoise", "bounces", "exposure", "blender")},
+        "scene_sha256": described["scene_sha256"],
+        "seeds": config.seeds,
+        "commit": commit(),
+        "device": machine(),
+        "seconds": round(time.monotonic() - start, 1),
+        "time": datetime.now(UTC).isoformat(timespec="seconds"),
+    }
 
 
 # --- archive ---------------------------------------------------------------------------------------------
@@ -440,7 +452,7 @@ def main(arguments: list[str] | None = None) -> int:
             elif isinstance(config, Floor):
                 measure_floor(config, bars)
             elif isinstance(config, Card):
-                print(dataset_card.write(**asdict(config)))
+                print(dataset_card.write(**asdict(config), references=REFERENCE_SAMPLES))
             elif isinstance(config, Pack):
                 pack_set(config, bars)
             else:

@@ -36,6 +36,11 @@ def frame_info(index: int, size: tuple[int, int], *, reset: bool = False, **came
     return FrameInfo(index, halton_jitter(index), reset, view.world_from_view, view.tan_half_fov)
 
 
+def reference_of(color: np.ndarray) -> np.ndarray:
+    """A stand-in for the anti-aliased colour: half as bright, and mirrored."""
+    return color[:, ::-1] * 0.5
+
+
 def make_sequence(
     path: Path,
     *,
@@ -46,6 +51,7 @@ def make_sequence(
     jitter: Callable[[tuple[float, float]], tuple[float, float]] | None = None,
     still: bool = False,
     frozen: bool = False,
+    reference: bool = False,
     **writer: Any,
 ) -> Sequence:
     """Write a sequence of the analytic scene and open it.
@@ -54,6 +60,7 @@ def make_sequence(
         spoil: called with "hr", "x2", ..., the frame's number and the layers, which it may change.
         jitter: what the metadata says of a jitter that was rendered; the sequence is then opened unchecked.
         still, frozen: the camera, the objects do not move.
+        reference: also write this layer, which is another image than the colour.
         **writer: more arguments of `SequenceWriter`.
     """
     head: dict[str, Any] = {"name": path.name, "size": size, "scales": scales, "license": "CC0-1.0"} | writer
@@ -66,6 +73,8 @@ def make_sequence(
                 images[f"x{s}"] = analytic.render(
                     index, small, jitter_px=info.jitter_px, still=still, frozen=frozen
                 )
+            if reference:
+                images["hr"]["reference"] = reference_of(images["hr"]["color"])
             for name, layers in images.items():
                 for extra in set(layers) - set(LAYERS):
                     del layers[extra]

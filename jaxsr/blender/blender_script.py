@@ -7,7 +7,8 @@ Imports bpy and the standard library only. The job is a JSON object: `scene` ({"
 path, "arguments": {...}} with a function `build` and a dict `SETTINGS`), `out` (folder), and, each null for
 the scene's own: `frames` [first, last], `size` [W, H], `samples`, `denoise`, `exposure`; further `scales`,
 `jitter_px` (a cycle of [x, y] in LR pixels: frame f uses entry (f - 1) mod length), `seed`, `threads`, `skip`
-(frame numbers), `only` (subset of "hr", "x2", ... or null), `color_only`, `jitter_hr` (the HR G-buffer is
+(frame numbers), `only` (subset of "hr", "x2", ... or null), `kinds`
+(subset of "gbuffer", "color", "reference" or null), `jitter_hr` (the HR G-buffer is
 jittered too, by the same numbers in HR pixels), `reference` (samples per pixel of an anti-aliased HR colour,
 0 for none, null for as many as the colour has). With `attended`, one line of JSON with further entries of the
 job is read from stdin after the scene was loaded, and the end of stdin (the parent is gone) ends the process,
@@ -284,10 +285,9 @@ class Renderer:
         return [n for n in named if only is None or n[0] in only]
 
     def kinds(self, name: str) -> tuple[str, ...]:
-        if self.job.get("color_only"):
-            return ("color",)
         reference = ("reference",) if name == "hr" and self.described["reference"] else ()
-        return ("gbuffer", "color", *reference)
+        wanted = self.job.get("kinds")
+        return tuple(k for k in ("gbuffer", "color", *reference) if wanted is None or k in wanted)
 
     def shift(self, camera: Any, jitter_px: list[float], size: list[int]) -> None:
         """Moves the lens so that I_J(p) = I_N(p + J), whatever the camera's sensor fit."""

@@ -45,6 +45,6 @@ def choose_truth(sequences: Iterable[Sequence], wanted: Truth | None = None) -> 
         where=sequence.path,
         expected=f"layer {wanted or 'reference or color'} in hr/",
         fix="render it"
-        + (" (jaxsr render --reference)" if wanted == "reference" else "")
+        + (" (jaxsr render --reference-samples)" if wanted == "reference" else "")
         + ", or use `jaxsr upscale`, which needs none",
     )

@@ -296,8 +296,8 @@ def program():
 
 def render_scene(out: Path, program: str, frames=(1, 4), split="test", **more) -> Path:
     arguments = {"seed": 0, "split": split, "clip": 0, "frames": 4}
-    more = {"size": SIZE, "scales": (2, 4), "threads": 1} | more
-    return render(SCENE, out, frames, blender=program, scene_arguments=arguments, position=True, **more)
+    more = {"size": SIZE, "scales": (2, 4), "threads": 1, "position": True} | more
+    return render(SCENE, out, frames, blender=program, scene_arguments=arguments, **more)
 
 
 @pytest.fixture(scope="module")
@@ -383,6 +383,59 @@ def test_depth_position_and_rays_agree(rendered, name, scale):
         both = in_cube & (ids == CUBE)
         np.testing.assert_allclose(depth[both], near[both], rtol=2e-3)
         assert np.abs(np.linalg.norm(buffers.normal[hit], axis=-1) - 1).max() < 2e-3
+
+
+def blackman_harris(image: np.ndarray, factor: int, width: float = 3.0) -> np.ndarray:
+    """Pixels `factor` times larger, each a mean under a window of `width`: twice what Cycles is told."""
+    h, w, _ = image.shape
+
+    def weights(small: int) -> np.ndarray:
+        centre = factor * (np.arange(small // factor) + 0.5) - 0.5
+        u = (np.arange(small) - centre[:, None]) / (factor * width) + 0.5
+        terms = zip((0.35875, -0.48829, 0.14128, -0.01168), range(4), strict=True)
+        window = sum(a * np.cos(2 * np.pi * k * u) for a, k in terms) * ((u > 0) & (u < 1))
+        return window / window.sum(1, keepdims=True)
+
+    return np.einsum("yi,xj,ijc->yxc", weights(h), weights(w), image)
+
+
+@pytest.mark.blender
+def test_the_reference_is_the_scene_under_a_wide_filter(tmp_path, program):
+    more = {"scales": (), "position": False, "samples": 8}
+    seq = Sequence.open(render_scene(tmp_path / "a", program, (2, 2), **more, reference_samples=256))
+    assert seq.generator["reference_samples"] == 256
+    large = (SIZE[0] * 6, SIZE[1] * 6)
+    fine = Sequence.open(render_scene(tmp_path / "b", program, (2, 2), **more | {"size": large}))
+    expected = blackman_harris(fine.truth(0), 6)
+    lit = expected.max(-1) < 1.5  # of the lamp itself no few samples tell enough
+    error = {
+        truth: np.sqrt(np.mean((seq.truth(0, truth) - expected)[lit] ** 2))
+        for truth in ("color", "reference")
+    }
+    assert error["reference"] < 0.2 * error["color"], error
+
+
+@pytest.mark.blender
+def test_only_buffers_are_jittered_at_high_resolution(tmp_path, program):
+    plain, jittered = (
+        Sequence.open(
+            render_scene(tmp_path / name, program, (1, 2), scales=(2,), jitter_hr=name == "jittered")
+        )
+        for name in ("plain", "jittered")
+    )
+    for i in range(2):
+        for truth in ("color", "reference"):
+            np.testing.assert_array_equal(jittered.truth(i, truth), plain.truth(i, truth))
+        np.testing.assert_array_equal(jittered.frame(i, 2).color_linear, plain.frame(i, 2).color_linear)
+        jitter = jittered.infos[i].jitter_px
+        assert plain.infos[i].hr_jitter_px == (0, 0)
+        np.testing.assert_allclose(jittered.infos[i].hr_jitter_px, jitter)
+        buffers = jittered.frame(i, 2).hr
+        camera = camera_at(jittered.infos[i].index)
+        plane = -camera.world_from_view[2, 3] / rays(camera, SIZE[1], SIZE[0], jitter)[..., 2]
+        ground = buffers.object_id[..., 0] == PLANE
+        assert ground.sum() > 100
+        np.testing.assert_allclose(buffers.depth_linear[..., 0][ground], plane[ground], rtol=2e-3)
 
 
 @pytest.mark.blender

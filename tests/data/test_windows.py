@@ -10,7 +10,7 @@ from jaxsr.data.windows import NEEDS, WindowSource, stack
 from jaxsr.errors import JaxsrError
 from jaxsr.frames import GBuffer
 from jaxsr.methods import Needs, Windows
-from tests.builders import make_sequence
+from tests.builders import edit_frames, make_sequence
 
 SMALL = {"size": (16, 8), "scales": (2, 4)}
 COLOR = frozenset({"lr.color"})
@@ -50,6 +50,23 @@ def test_a_window_is_the_frames_of_the_sequence(tmp_path, scale):
             )
             np.testing.assert_array_equal(batch.truth_linear[0, t], seq.truth(i + t))
         assert batch.frames.scale == scale
+
+
+def test_the_truth_of_a_window_is_the_layer_that_is_asked_for(tmp_path):
+    seq = make_sequence(tmp_path / "s", **SMALL, frames=2, reference=True)
+    for truth in ("color", "reference"):
+        source = source_of(seq, truth=truth)
+        np.testing.assert_array_equal(source[1].truth_linear[0], seq.truth(1, truth))
+    bare = make_sequence(tmp_path / "bare", **SMALL, frames=2)
+    with pytest.raises(JaxsrError, match="reference"):
+        source_of(bare, truth="reference")
+
+
+def test_windows_carry_the_jitter_of_hr_buffers(tmp_path):
+    seq = make_sequence(tmp_path / "s", **SMALL, frames=2)
+    edit_frames(seq.path, lambda frame: frame.update(hr_jitter_px=[0.25 * frame["index"], -0.5]))
+    source = source_of(seq, windows=Windows(2, made=None))
+    np.testing.assert_array_equal(source[0].frames.hr_jitter_px, [[0.25, -0.5], [0.5, -0.5]])
 
 
 def test_windows_do_not_cross_cuts(tmp_path):

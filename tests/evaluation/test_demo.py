@@ -78,13 +78,14 @@ def test_extrapolated_frames_are_marked(demo):
 def test_truth_is_never_seen(name, tmp_path):
     """HR colour, and LR colour of extrapolated frames, replaced by NaN: every output file stays the same."""
 
-    clean = make_sequence(tmp_path / "clean", frames=4)
-    poisoned = make_sequence(tmp_path / "poisoned", frames=4)
+    clean = make_sequence(tmp_path / "clean", frames=4, reference=True)
+    poisoned = make_sequence(tmp_path / "poisoned", frames=4, reference=True)
     hidden = [*(poisoned.path / "hr").iterdir(), *(poisoned.path / "x2" / f"000{i}.exr" for i in (2, 4))]
     for file in hidden:
         channels, metadata = read_exr(file)
-        nan = {k: np.full_like(v, np.nan) for k, v in channels.items() if k.startswith("color.")}
-        assert len(nan) == 3
+        spoilt = ("color.", "reference.")
+        nan = {k: np.full_like(v, np.nan) for k, v in channels.items() if k.startswith(spoilt)}
+        assert len(nan) == (6 if file.parent.name == "hr" else 3)
         write_exr(file, channels | nan, metadata)
     learned = METHODS[name].network is not None
     given = random_weights(tmp_path / f"{name}.safetensors", scale=2, method=name) if learned else name

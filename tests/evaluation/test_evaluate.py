@@ -26,13 +26,15 @@ from jaxsr.evaluation.regions import regions
 from jaxsr.evaluation.running import Evaluation, Settings, run_method
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.images import read_png
+from jaxsr.io.sequence import Sequence
 from jaxsr.methods import METHODS
 from jaxsr.report.results import REGIONS
 from jaxsr.report.tables import rich_tables
 from jaxsr.runtime import upscale
 from jaxsr.runtime.load import find_method, shipped_scales
+from jaxsr.runtime.upscale import display
 from jaxsr.weights.file import load_weights, save_weights
-from tests.builders import make_sequence, random_weights
+from tests.builders import edit_frames, make_sequence, random_weights
 
 KEYS = ("psnr", "ssim", "flip", "tpsnr")  # LPIPS takes longer to compile than all the rest to run
 SETTINGS = Settings(2, metrics=KEYS)
@@ -155,6 +157,44 @@ def test_the_truth_is_never_seen(done, data, tmp_path):
         for file in files:
             other = tmp_path / "out" / "poisoned" / method / "exr" / file.name
             assert file.read_bytes() == other.read_bytes()
+
+
+def test_results_are_of_the_truth_that_is_asked_for(tmp_path, counted):
+    """The reference by default, the colour on demand; each result says which it is."""
+    make_sequence(tmp_path / "s", frames=2, size=SIZE, reference=True)
+    places, out = [tmp_path / "s"], tmp_path / "out"
+    for truth, named, words in (
+        (None, "reference", "the anti-aliased reference"),
+        ("color", "color", "the aliased truth"),
+    ):
+        (section,) = run(places, ["nearest"], out, truth=truth)
+        assert section.title == f"s, x2, super-resolution, against {words}"
+        document = json.loads((out / "metrics.json").read_text())
+        assert document["meta"]["truth"] == document["sections"][0]["meta"]["truth"] == named
+        assert words in (out / "report.html").read_text()
+        shown = read_png(out / "s" / "truth" / "png" / "0002.png")
+        expected = display(Sequence.open(places[0]).truth(1, named), 1.0)
+        assert np.abs(shown - expected).max() < 1 / 255
+        made = read_png(out / "s" / "nearest" / "png" / "0002.png")
+        psnr = -10 * np.log10(np.mean((made.astype(float) - expected) ** 2))
+        assert section.methods[0].metrics["psnr"][1] == pytest.approx(psnr, abs=0.05)
+    assert counted == ["nearest", "nearest"], "what was kept for one truth does not stand for the other"
+
+
+def test_a_truth_that_a_frame_lacks_is_refused_before_any_work(data, tmp_path):
+    with pytest.raises(
+        JaxsrError, match=r"frame 1 has no truth.*expected layer reference.*--reference-samples"
+    ):
+        run([data / "set"], ["nearest"], tmp_path / "out", truth="reference")
+    assert not (tmp_path / "out").exists()
+
+
+def test_buffers_that_are_jittered_are_refused_by_those_who_do_not_expect_it(data, tmp_path):
+    shutil.copytree(data / "set" / "one", tmp_path / "s")
+    edit_frames(tmp_path / "s", lambda frame: frame.update(hr_jitter_px=[0.25, 0.0]))
+    with pytest.raises(JaxsrError, match=r"hr_jitter_px 0 in all frames"):
+        run([tmp_path / "s"], ["guided"], tmp_path / "out")
+    run([tmp_path / "s"], ["bilinear", "guided-taau"], tmp_path / "out")
 
 
 @pytest.fixture

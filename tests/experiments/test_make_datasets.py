@@ -14,7 +14,7 @@ from experiments import make_datasets as md
 from jaxsr.errors import JaxsrError
 from jaxsr.io import archive
 from jaxsr.io.archive_coding import decode_plane, encode_plane, quantise_normal, restore_normal
-from jaxsr.io.exr import read_exr
+from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.sequence import Sequence, SequenceWriter
 from jaxsr.io.writing import FrameInfo
 from jaxsr.progress import Bars
@@ -35,6 +35,7 @@ def layers(rng: np.random.Generator, h: int, w: int) -> dict[str, np.ndarray]:
     normal = rng.normal(size=(h, w, 3))
     out = {
         "color": rng.lognormal(0, 2, (h, w, 3)),
+        "reference": rng.lognormal(0, 1, (h, w, 3)),
         "depth": np.exp(rng.uniform(-1, 5, (h, w, 1))),
         "motion": rng.uniform(-20, 20, (h, w, 2)),
         "normal": normal / np.linalg.norm(normal, axis=-1, keepdims=True),
@@ -49,7 +50,9 @@ def layers(rng: np.random.Generator, h: int, w: int) -> dict[str, np.ndarray]:
     return {name: x.astype(np.float32) for name, x in out.items()}
 
 
-def write_sequence(folder: Path, name: str = "bunker-train-0", frames: int = 3, size=SIZE) -> Path:
+def write_sequence(
+    folder: Path, name: str = "bunker-train-0", frames: int = 3, size=SIZE, reference: bool = True
+) -> Path:
     rng = np.random.default_rng(0)
     w, h = size
     notes = {"tool": "test", "samples": 4, "denoise": False, "seed": 0, "blender": "5.0.1"}
@@ -57,8 +60,21 @@ def write_sequence(folder: Path, name: str = "bunker-train-0", frames: int = 3, 
         folder, name=name, size=size, scales=(2,), license="CC0-1.0", generator=notes
     ) as writer:
         for i in range(1, frames + 1):
-            info = FrameInfo(i, (0.25, -0.125 * i), i == 1, camera_matrix(i), (0.6, 0.34), (0.1, 0.0))
-            writer.write_frame(info, layers(rng, h, w), {2: layers(rng, h // 2, w // 2)})
+            info = FrameInfo(
+                i,
+                (0.25, -0.125 * i),
+                i == 1,
+                camera_matrix(i),
+                (0.6, 0.34),
+                (0.1, 0.0),
+                hr_jitter_px=(0.125 * i, 0.5),
+            )
+            low = layers(rng, h // 2, w // 2)
+            del low["reference"]
+            high = layers(rng, h, w)
+            if not reference:
+                del high["reference"]
+            writer.write_frame(info, high, {2: low})
     return folder
 
 
@@ -93,7 +109,8 @@ def test_round_trip_within_the_stated_errors(packed, tmp_path):
     for i in range(len(a)):
         assert a.infos[i].to_json() == b.infos[i].to_json()
         fa, fb = a.frame(i, 2), b.frame(i, 2)
-        for x, y in ((a.truth(i), b.truth(i)), (fa.color_linear, fb.color_linear)):
+        pairs = [(a.truth(i, name), b.truth(i, name)) for name in ("color", "reference")]
+        for x, y in (*pairs, (fa.color_linear, fb.color_linear)):
             np.testing.assert_allclose(y, x, rtol=2.0**-6 * 1.01, atol=1e-6)
         for x, y in ((fa.lr, fb.lr), (fa.hr, fb.hr)):
             sky = ~np.isfinite(x.depth_linear[..., 0])
@@ -248,6 +265,59 @@ def test_archive_of_limited_size(tmp_path):
 # --- the script ------------------------------------------------------------------------------------------
 
 
+def lay_references(shelf: Path, source: Path, indices) -> None:
+    """References beside an archive, as files of their own."""
+    folder = shelf / "reference" / "train" / "bunker-train-0"
+    folder.mkdir(parents=True)
+    for i in indices:
+        image = Sequence.open(source).truth(i - 1)[::-1] * 0.25
+        write_exr(folder / f"{i:04d}.exr", {f"reference.{c}": image[..., k] for k, c in enumerate("RGB")})
+
+
+@pytest.mark.parametrize("indices", [(1, 2, 3), (1, 3)])
+def test_references_beside_an_archive_are_joined_where_no_frame_lacks_one(tmp_path, indices):
+    source = write_sequence(tmp_path / "source" / "train" / "bunker-train-0", reference=False)
+    file = tmp_path / "shelf" / "train.jsrz"
+    archive.pack({"train/bunker-train-0": source}, file)
+    lay_references(file.parent, source, indices)
+    assert md.main(["unpack", str(tmp_path / "out"), "--archive", str(file)]) == 0
+    (found,) = (tmp_path / "out").rglob("sequence.json")
+    seq = Sequence.open(found.parent)
+    assert ["reference" in seq.layers("hr", i) for i in range(3)] == [len(indices) == 3] * 3
+    if len(indices) == 3:
+        expected = Sequence.open(source).truth(1)[::-1] * 0.25
+        np.testing.assert_allclose(seq.truth(1, "reference"), expected, rtol=2e-3, atol=1e-4)
+    assert seq.infos[1].hr_jitter_px == (0.25, 0.5)
+
+
+def test_noise_floors_of_both_truths_are_kept_apart(tmp_path, monkeypatch):
+    """Two renders that differ by d everywhere have a floor of 10 log10(2 / d^2)."""
+    asked = []
+
+    def colors(config, clip, truth, seed, folder, tick):
+        asked.append((truth, clip.name, seed))
+        high = {"color": 1e-3, "reference": 2e-3}[truth] * (seed == 2)
+        described = {"samples": 4, "reference": 9, "denoise": False, "bounces": 1, "exposure": 1.0}
+        return {f: np.full((2, 2, 3), high, np.float32) for f in config.frames}, described | {
+            "blender": "5",
+            "scene_sha256": "0",
+        }
+
+    monkeypatch.setattr(md, "_colors", colors)
+    monkeypatch.setattr(md, "to_display", lambda image, exposure: image)
+    results = tmp_path / "floors.json"
+    config = md.Floor(scenes=("docks",), splits=("test",), frames=(8,), seeds=(1, 2), results=results)
+    with Bars(quiet=True) as bars:
+        md.measure_floor(replace(config, truths=("color",)), bars)
+        md.measure_floor(replace(config, truths=("reference",)), bars)
+    assert asked == [(truth, "docks-test-0", seed) for truth in ("color", "reference") for seed in (1, 2)]
+    found = {truth: entries["docks-test-0"] for truth, entries in json.loads(results.read_text()).items()}
+    assert {truth: (e["psnr_db"], e["samples"]) for truth, e in found.items()} == {
+        "color": (63.01, 4),
+        "reference": (56.99, 9),
+    }
+
+
 def test_sets_share_no_clip_and_interleave_scenes():
     train, test = (md.clips_of(md.Render(set=s)) for s in ("train", "test"))
     assert {c.split for c in train} == {"train"}
@@ -352,12 +422,15 @@ def test_pack_unpack_and_card_from_the_command_line(tmp_path, monkeypatch, capsy
 
     floors = tmp_path / "floors.json"
     entry = {"psnr_db": 41.5, "samples": 64, "frames": {"1": 41.5}, "size": [384, 216]}
-    floors.write_text(json.dumps({"docks-test-0": entry}))
+    other = entry | {"psnr_db": 39.2, "samples": 128, "frames": {"8": 39.2}}
+    floors.write_text(json.dumps({"color": {"docks-test-0": entry}, "reference": {"docks-test-0": other}}))
     arguments = ["--out", str(tmp_path / "data"), "--floors", str(floors), "--docs", str(tmp_path / "docs")]
     assert md.main(["card", *arguments]) == 0
     card = (tmp_path / "docs" / "data_card.md").read_text()
     assert "| test | docks-test-0 | 3 | 16x8 | x2 | 4 | no |" in card
-    assert "| docks-test-0 | 64 | 41.5 | 1: 41.5 | 384x216 |" in card
+    assert "| color | docks-test-0 | 64 | 41.5 | 1: 41.5 | 384x216 |" in card
+    assert "| reference | docks-test-0 | 128 | 39.2 | 8: 39.2 | 384x216 |" in card
+    assert "| docks | 32 | 64 | 128 |" in card, "samples of the references"
     assert "12 CPU seconds (1 sequences" in card
     assert "bias of the denoiser" in card
     assert (tmp_path / "docs" / "images" / "data_test.png").is_file()

@@ -375,6 +375,30 @@ class TestErrors:
             tiny_method.train(data, out, steps=20, learning_rate=1e-2)
         assert digest(out) == digest(whole)
 
+    def test_another_truth(self, tmp_path):
+        """The truth is in config.json and in the weights, and the same "best" may mean another one later."""
+        make_sequence(tmp_path / "data" / "clip", frames=2, reference=True)
+        out = tmp_path / "out"
+        tiny_method.train(tmp_path / "data", out, steps=1)
+        assert json.loads((out / "config.json").read_text())["config"]["truth"] == "reference"
+        _, header = load_weights(out / "weights.safetensors")
+        assert header["training"]["config"]["truth"] == "reference"
+        tiny_method.train(tmp_path / "data", out, steps=1, truth="reference")
+        with pytest.raises(JaxsrError, match=r"truth: reference -> color; choose another"):
+            tiny_method.train(tmp_path / "data", out, steps=1, truth="color")
+
+    def test_no_such_truth(self, data, tmp_path):
+        with pytest.raises(JaxsrError, match=r"frame 1 has no truth.*layer reference"):
+            tiny_method.train(data, tmp_path / "out", truth="reference")
+
+    def test_an_old_training_had_the_color_as_its_truth(self, whole, data, tmp_path):
+        out = copied(whole, tmp_path)
+        record = json.loads((out / "config.json").read_text())
+        assert record["config"].pop("truth") == "color"
+        (out / "config.json").write_text(json.dumps(record))
+        tiny_method.train(data, out)
+        assert digest(out) == digest(whole)
+
     def test_what_may_change(self, whole, data, tmp_path):
         """Intervals, and where the data lie."""
         moved, out = tmp_path / "elsewhere", copied(whole, tmp_path)
