@@ -11,6 +11,7 @@ from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path
 from jaxsr.io.images import write_png
 from jaxsr.io.sequence import Sequence
+from jaxsr.io.truth import choose_truth
 from jaxsr.ops.color import to_display
 
 SETS = ("sample", "train", "test")
@@ -37,8 +38,7 @@ samples below.
 
 The `reference` is the other truth: HR colour of the same scene, frame and camera, without jitter,
 anti-aliased by a Blackman-Harris filter (1.5 pixels in Blender, which is a support of 3 pixels), and denoised
-where the colour is. Its samples per
-pixel:
+where the colour is. Its samples per pixel:
 
 | scene | training clips | test set | test clips of the sample |
 |---|---|---|---|
@@ -51,7 +51,8 @@ pixel:
 {rows}
 
 Total: {frames} frames, {megabytes:.1f} MB, {cpu:.0f} CPU seconds{note}. Blender {blender}.
-The script can render two more training clips of each scene (3 and 4), which the archives do not hold.
+References that were joined to sequences of an archive are not in the CPU seconds. The script can render two
+more training clips of each scene (3 and 4), which the archives do not hold.
 Training and test clips have camera paths, scene seeds and layouts of their own: they share no frames.
 
 ## Noise of the two truths
@@ -84,7 +85,8 @@ def _strip(sequences: list[Sequence], path: Path, width: int = 256) -> None:
     """The middle frame of each side by side, every few pixels of it."""
     shown = []
     for seq in sequences:
-        image = np.asarray(to_display(seq.truth(len(seq) // 2), seq.exposure))
+        truth = seq.truth(len(seq) // 2, choose_truth([seq]))
+        image = np.asarray(to_display(truth, seq.exposure))
         height = round(width * seq.size[1] / seq.size[0])
         rows = (np.arange(height) * seq.size[1]) // height
         columns = (np.arange(width) * seq.size[0]) // width

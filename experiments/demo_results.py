@@ -22,8 +22,10 @@ from PIL import Image, ImageDraw, ImageFont
 from jaxsr.data.sample import unpack_sample
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description, run_demo
+from jaxsr.evaluation.running import TRUTH_WORDS
 from jaxsr.files import atomic_path
 from jaxsr.io.images import write_png
+from jaxsr.io.truth import Truth
 from jaxsr.progress import Bars
 from jaxsr.report.embedding import ImageOrPath, to_bytes
 from jaxsr.report.results import SequenceResult
@@ -52,6 +54,8 @@ class Config:
     scales: tuple[int, ...] = (2, 4)
     frame: int = 6
     """The frame shown in the pictures; even frames are extrapolated."""
+    truth: Truth | None = None
+    """The reference by default."""
 
 
 def task_of(section: SequenceResult) -> str:
@@ -187,7 +191,7 @@ def main(config: Config) -> None:
         for scale in config.scales:
             paths = unpack_sample(Path(folder) / "sample", "test", progress=progress)
             out = Path(folder) / f"x{scale}"
-            sections += run_demo(out, paths, scale=scale, lpips=True, progress=progress)
+            sections += run_demo(out, paths, scale=scale, lpips=True, truth=config.truth, progress=progress)
         pictures = {}  # while the frames are there
         for task in LABELS:
             shown = [s for s in sections if s.meta["scale"] == (4 if task == "super-resolution" else 2)]
@@ -197,6 +201,7 @@ def main(config: Config) -> None:
         seed="none: nothing is random",
         script="experiments/demo_results.py",
         scales=config.scales,
+        truth=sections[0].meta["truth"],
     )
     RESULTS.mkdir(parents=True, exist_ok=True)
     with atomic_path(RESULTS / "demo.json") as temporary:
@@ -204,7 +209,8 @@ def main(config: Config) -> None:
         temporary.write_text(json.dumps(document, indent=1) + "\n")
     lines = [
         f"Measured by `experiments/demo_results.py` at {meta['commit']} on {meta['date']} ({meta['device']}, "
-        f"jax {meta['jax']}): mean ± standard deviation over frames. Display-referred colour, no crop.",
+        f"jax {meta['jax']}): mean ± standard deviation over frames. Display-referred colour, no crop, "
+        f"against {TRUTH_WORDS[meta['truth']]}.",
         "",
     ]
     for task in LABELS:

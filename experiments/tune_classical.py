@@ -35,9 +35,11 @@ from rich.progress import track
 from jaxsr.data.sample import unpack_sample
 from jaxsr.errors import JaxsrError
 from jaxsr.evaluation.demo import description
+from jaxsr.evaluation.running import TRUTH_WORDS
 from jaxsr.files import atomic_path
 from jaxsr.frames import Frame
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.io.truth import Truth, choose_truth
 from jaxsr.methods import METHODS, Method, accumulation, guided, guided_taau, taau
 from jaxsr.methods.base import step as step_of
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
@@ -75,17 +77,19 @@ class Config:
     """Clips per scene, for TAAU."""
     rounds: int = 1
     """Passes over the constants of TAAU."""
+    truth: Truth | None = None
+    """The reference by default, if all frames have one."""
     out: Path = RESULTS
 
 
 class Pair:
     """A frame, its predecessor's buffers and both truths, on the device."""
 
-    def __init__(self, sequence: FrameSequence, i: int):
+    def __init__(self, sequence: FrameSequence, i: int, truth: Truth):
         self.frame: Frame = jax.device_put(sequence.frame(i, max(sequence.scales)))
         self.previous: Frame = jax.device_put(sequence.frame(i - 1, max(sequence.scales)))
-        self.truth = jnp.asarray(sequence.truth(i))
-        self.previous_truth = jnp.asarray(sequence.truth(i - 1))
+        self.truth = jnp.asarray(sequence.truth(i, truth))
+        self.previous_truth = jnp.asarray(sequence.truth(i - 1, truth))
         self.exposure = sequence.exposure
 
 
@@ -168,11 +172,11 @@ def coordinate_search(
     return {"options": asdict(best), "psnr": value, "start_psnr": trials[0]["psnr"], "trials": trials}
 
 
-def tune_taau(sequences: Sequence[FrameSequence], rounds: int) -> dict[str, Any]:
+def tune_taau(sequences: Sequence[FrameSequence], rounds: int, truth: Truth) -> dict[str, Any]:
     clips: list[Clip] = [
         (
             [jax.device_put(f) for f in observed(s, METHODS["guided-taau"], scale)],
-            jnp.stack([jnp.asarray(s.truth(i)) for i in range(len(s))]),
+            jnp.stack([jnp.asarray(s.truth(i, truth)) for i in range(len(s))]),
             s.exposure,
         )
         for s in sequences
@@ -264,13 +268,15 @@ def main(config: Config) -> None:
     start = time.time()
     with tempfile.TemporaryDirectory() as temporary:
         sequences = training_sequences(config, Path(temporary))
+        truth = choose_truth(sequences, config.truth)
         if config.what == "reprojection":
-            pairs = [Pair(s, i) for s in sequences for i in range(1, len(s)) if not s.infos[i].reset]
+            pairs = [Pair(s, i, truth) for s in sequences for i in range(1, len(s)) if not s.infos[i].reset]
             result = tune_reprojection(pairs)
         else:
-            result = tune_taau(sequences, config.rounds)
+            result = tune_taau(sequences, config.rounds, truth)
     meta = description(
         script=f"experiments/tune_classical.py {config.what}",
+        truth=truth,
         seconds=round(time.time() - start),
         sequences=[f"{s.name}: {len(s)} frames {s.size[0]}x{s.size[1]}" for s in sequences],
         seed="none: the search is deterministic",
@@ -282,7 +288,8 @@ def main(config: Config) -> None:
         f"# Constants of {'guided reprojection' if config.what == 'reprojection' else 'TAAU'}",
         "",
         f"`{meta['script']}` at {meta['commit']} on {meta['date']}, {meta['device']}, {meta['seconds']} s; "
-        f"training frames: {', '.join(meta['sequences'])}. PSNR of display colour, whole frames.",
+        f"training frames: {', '.join(meta['sequences'])}. PSNR of display colour, whole frames, "
+        f"against {TRUTH_WORDS[truth]}.",
         "",
         *report(config, result),
         "",

@@ -3,7 +3,8 @@
     python experiments/fusion_sr/figures.py [--network fusion-sr | fusion-sr-{scene} | FILE.safetensors]
 
 Runs the methods over the test clips of the sample and writes docs/images/fusion_sr_<scene>.png: the truth of
-one frame with two crops marked, and the crops of the input, of what each method made, and of the truth.
+one frame with two crops marked, and the crops of the input, of what each method made, and of the truth. As in
+the paper, the truth is the aliased colour.
 PSNR and LPIPS of that whole frame stand below, with the best in black. The crops are not picked by hand: they
 lie where the squared error, summed over all methods, is largest.
 """
@@ -70,7 +71,7 @@ def columns(sequence: FrameSequence, methods: Sequence[LoadedMethod], scale: int
     """
     if not 1 <= frame <= len(sequence):
         raise JaxsrError("no such frame", where=sequence.path, expected=f"1 to {len(sequence)}", found=frame)
-    truth = display(sequence.truth(frame - 1), sequence.exposure)
+    truth = display(sequence.truth(frame - 1, "color"), sequence.exposure)
     given = display(np.asarray(sequence.frame(frame - 1, scale).color_linear), sequence.exposure)
     keys = [key for key in ("psnr", "lpips") if key in available()]
     found = [Shown("input", given.repeat(scale, 0).repeat(scale, 1), {})]

@@ -126,7 +126,7 @@ def lamps(sequence: FrameSequence) -> list[Lamp]:
         JaxsrError: no lamp changes, so that nothing would be measured.
     """
     found = []
-    truths = [display(sequence.truth(i), sequence.exposure) for i in range(len(sequence))]
+    truths = [display(sequence.truth(i, "color"), sequence.exposure) for i in range(len(sequence))]
     for i in range(1, len(sequence)):
         now, before = (sequence.frame(k, 1, rendered=False) for k in (i, i - 1))
         warped = np.asarray(backward_warp(truths[i - 1], now.hr.motion_px))
@@ -231,7 +231,7 @@ def main(runs: Path = RUNS) -> None:
         sequence = FrameSequence.open(clip)
         count = len(sequence)
         found = lamps(sequence)
-        truths = np.stack([display(sequence.truth(i), sequence.exposure) for i in range(count)])
+        truths = np.stack([display(sequence.truth(i, "color"), sequence.exposure) for i in range(count)])
         inputs = [display(sequence.frame(i, SCALE).color_linear, sequence.exposure) for i in range(count)]
     made = {name: frames_of(name, runs, sequence.name, count) for name in (*CURRENT, *HISTORY)}
     mean = np.mean([tile_means(truth) for truth in truths], 0)

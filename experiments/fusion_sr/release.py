@@ -31,8 +31,9 @@ from jaxsr.data.sample import unpack_sample  # noqa: E402
 from jaxsr.errors import JaxsrError  # noqa: E402
 from jaxsr.evaluation.demo import description  # noqa: E402
 from jaxsr.evaluation.evaluate import evaluate  # noqa: E402
-from jaxsr.evaluation.running import Settings  # noqa: E402
+from jaxsr.evaluation.running import TRUTH_WORDS, Settings  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
+from jaxsr.io.truth import Truth  # noqa: E402
 from jaxsr.methods import build  # noqa: E402
 from jaxsr.progress import Bars  # noqa: E402
 from jaxsr.report.results import SequenceResult  # noqa: E402
@@ -119,14 +120,21 @@ def release(name: str, run: Run, weights: Path, head: dict[str, Any]) -> None:
             [*RIVALS, str(weights)],
             Path(folder) / "out",
             Settings(scale=run.config.scale),
+            truth=truth_of(head),
             title=name,
             progress=progress,
         )
-    meta = description(weights=weights.name)
+    meta = description(weights=weights.name, truth=truth_of(head))
     results = as_json(sections, title=name, meta=meta)
     write(RESULTS / f"{name}.json", json.dumps(results, indent=1) + "\n")
     write(CARDS / f"{name}.md", card(name, run, head, sections, weights))
     print(f"{weights.name}: {weights.stat().st_size / 1e6:.2f} MB")
+
+
+def truth_of(head: dict[str, Any]) -> Truth:
+    """What a network was trained on, and is measured against; before there was a choice it was the colour."""
+    truth: Truth = head["training"]["config"].get("truth", "color")
+    return truth
 
 
 def table(sections: list[SequenceResult]) -> list[str]:
@@ -152,6 +160,7 @@ def card(name: str, run: Run, head: dict[str, Any], sections: list[SequenceResul
     values = {**settings, **training["loss"], **training["config"], **training["made"]}
     values |= {
         "name": name,
+        "truth": TRUTH_WORDS[truth_of(head)],
         "weights": f"{sum(sizes.values()) - statistics:,}",
         "statistics": f"{statistics:,}",
         "megabytes": f"{weights.stat().st_size / 1e6:.2f}",

@@ -40,6 +40,7 @@ from jaxsr.evaluation.measuring import Reference  # noqa: E402
 from jaxsr.evaluation.running import Evaluation, Settings, run_method  # noqa: E402
 from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.sequence import Sequence as FrameSequence  # noqa: E402
+from jaxsr.io.truth import Truth  # noqa: E402
 from jaxsr.methods import LEARNED, Method, from_json, fusion_sr, to_json  # noqa: E402
 from jaxsr.methods.legacy import upgrade  # noqa: E402
 from jaxsr.progress import Bars  # noqa: E402
@@ -51,6 +52,8 @@ from jaxsr.training.loop import train  # noqa: E402
 RESULTS = ROOT / "experiments" / "results" / "fusion_sr"
 RUNS = ROOT / "experiments" / "cache" / "study"
 SCALE, WARM_UP, WINDOW = 4, 4, 5
+TRUTH: Truth = "color"
+"""That of the paper: aliased."""
 CLIPS = 3
 """Training clips of each scene, of the five that the training set has."""
 LOSS: dict[str, Any] = {
@@ -69,7 +72,15 @@ which would hide what buffers are worth."""
 BUFFERS = fusion_sr.BUFFERS
 
 BUDGET = TrainConfig(
-    scale=SCALE, steps=600, batch=4, crop=96, schedule="cosine", clip_norm=1.0, eval_every=300, save_every=100
+    scale=SCALE,
+    truth=TRUTH,
+    steps=600,
+    batch=4,
+    crop=96,
+    schedule="cosine",
+    clip_norm=1.0,
+    eval_every=300,
+    save_every=100,
 )
 
 
@@ -194,7 +205,7 @@ def measure(ready: LoadedMethod, clips: list[Path], frames: Path) -> dict[str, A
         sequences = [FrameSequence.open(clip) for clip in clips]
         advance = progress("measure", 2 * sum(map(len, sequences)))
         for sequence in sequences:
-            reference = Reference(sequence, in_regions=True)
+            reference = Reference(sequence, in_regions=True, truth=TRUTH)
             evaluation = Evaluation(sequence, Settings(SCALE, warmup=WARM_UP), reference, advance)
             result = run_method(evaluation, ready, frames / sequence.name)
             assert result.cost is not None
@@ -204,7 +215,7 @@ def measure(ready: LoadedMethod, clips: list[Path], frames: Path) -> dict[str, A
                 "metrics": result.metrics,
                 "regions": result.regions,
             }
-    measured = description(scale=SCALE, warm_up=WARM_UP)
+    measured = description(scale=SCALE, warm_up=WARM_UP, truth=TRUTH)
     measured["seconds"] = round(time.monotonic() - begun, 1)
     return {"measured": measured, "cost": dataclasses.asdict(result.cost), "scenes": scenes}
 

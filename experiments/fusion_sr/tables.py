@@ -346,7 +346,7 @@ def markdown(found: Mapping[str, Any]) -> list[str]:
         f"{found['hours']} h on {' and '.join(found['devices'])}; commit {', '.join(found['commits'])}; "
         f"measured at {', '.join(found['measured_at'])}, {', '.join(found['dates'])}, on frames "
         f"{found['frames'][0]} to {found['frames'][-1]} of "
-        f"each test clip. Display-referred: {found['display']}.",
+        f"each test clip, against the aliased truth. Display-referred: {found['display']}.",
     ]
     return lines
 
@@ -409,7 +409,7 @@ def _truth(scene: str) -> tuple[Any, Any]:
         sequence = FrameSequence.open(clip)
         position = [info.index for info in sequence.infos].index(FRAME)
         assert position >= WARM_UP
-        truth = display(sequence.truth(position), sequence.exposure)
+        truth = display(sequence.truth(position, "color"), sequence.exposure)
         given = display(sequence.frame(position, SCALE).color_linear, sequence.exposure)
     return truth, given.repeat(SCALE, 0).repeat(SCALE, 1)
 

@@ -1,6 +1,6 @@
 """Train the networks that ship with the package; an interrupted run resumes.
 
-    python experiments/fusion_sr/train_released.py [NAME ...] [--data DIR] [--runs DIR]
+    python experiments/fusion_sr/train_released.py [NAME ...] [--truth TRUTH] [--data DIR] [--runs DIR]
 
 `--data` is the training set of `experiments/make_datasets.py render --set train` (15 clips of 12 frames). The
 last frame of each clip is held back from training. Runs that start from others come after them. The loss is
@@ -11,6 +11,7 @@ crops are far below the paper's: these are for two CPU cores.
 import sys
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 ROOT = Path(__file__).resolve().parents[2]
 sys.path.insert(0, str(ROOT))
@@ -88,6 +89,7 @@ def folders_of(scenes: tuple[str, ...], data: Path) -> tuple[Path, ...]:
 
 def main(
     names: Positional[tuple[str, ...]] = (),
+    truth: Literal["reference", "color", "best"] = "best",
     data: Path = CACHE / "train",
     runs: Path = ROOT / "experiments" / "cache" / "runs",
 ) -> None:
@@ -95,12 +97,16 @@ def main(
 
     Args:
         names: of the runs.
+        truth: what to train on: "reference" is anti-aliased, "color" is not. "best": the reference where all
+            frames have one.
         data: folder of the training set.
         runs: folder for the runs.
     """
     for name, run in chosen(names).items():
         start = () if run.start is None else (str(runs / run.start / "weights.safetensors"),)
-        config = replace(run.config, data=folders_of(run.scenes, data), out=runs / name, init=start)
+        config = replace(
+            run.config, data=folders_of(run.scenes, data), out=runs / name, init=start, truth=truth
+        )
         print(f"{name}: {train(fusion_sr.method(OPTIONS, LOSS), config)}")
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from jaxsr.evaluation.measuring import Reference, metrics_with
 from jaxsr.evaluation.running import Evaluation, Settings, run_methods
 from jaxsr.io.sequence import Sequence as FrameSequence
+from jaxsr.io.truth import Truth, choose_truth
 from jaxsr.progress import Progress
 from jaxsr.provenance import provenance
 from jaxsr.report.embedding import to_bytes
@@ -39,11 +40,13 @@ def run_demo(
     *,
     scale: int,
     lpips: bool = False,
+    truth: Truth | None = None,
     progress: Progress,
 ) -> list[SequenceResult]:
     """Run the demo and write frames, videos, metrics and the page into `out`.
 
     Args:
+        truth: "reference" or "color"; by default the best that all frames of all sequences have.
         lpips: measure LPIPS too, if its extra is installed; it takes longer than all the rest.
         progress: told of each frame that is made and measured.
 
@@ -61,8 +64,9 @@ def run_demo(
     total = sum(len(s) * len(task.methods) for s in opened for task in tasks)
     advance = progress("frames", 2 * total)  # made, and measured
     sections, compiled = [], dict[Any, float]()
+    truth = choose_truth(opened, truth)
     for sequence in opened:
-        reference = Reference(sequence)
+        reference = Reference(sequence, truth=truth)
         for task in tasks:
             settings = Settings(scale, task.every, metrics=metrics_with(lpips))
             sections.append(
@@ -73,7 +77,7 @@ def run_demo(
                     compiled=compiled,
                 )
             )
-    meta = description(scale=scale, truth=sorted({str(section.meta["truth"]) for section in sections}))
+    meta = description(scale=scale, truth=truth)
     advance = progress("page", 1)
     write_metrics(out, sections, title="jaxsr demo", meta=meta)
     write_report(out / "report.html", sections, title="jaxsr demo", meta=meta)
