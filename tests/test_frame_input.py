@@ -144,3 +144,12 @@ def test_a_size_that_nothing_tells():
         Frame.of(hr={"depth": ones(HR, 1)}, rendered=False)
     with pytest.raises(JaxsrError, match="no images"):
         Frame.of(rendered=False)
+
+
+def test_jitter_of_hr_buffers_is_at_most_half_an_lr_pixel():
+    np.testing.assert_array_equal(Frame.of(**arguments()).hr_jitter_px, [0, 0])
+    frame = Frame.of(**arguments(hr_jitter=(1.0, -0.75)))
+    np.testing.assert_array_equal(frame.hr_jitter_px, np.float32([1.0, -0.75]))
+    for wrong in ((1.25, 0), (0, float("nan")), (0,), 0.5):
+        with pytest.raises(JaxsrError, match=r"hr_jitter: bad hr_jitter.*each in .*half an LR pixel"):
+            Frame.of(**arguments(hr_jitter=wrong))

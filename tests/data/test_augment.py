@@ -280,3 +280,13 @@ def test_bad_crops_are_named(box, message):
     x, y, w, h = box
     with pytest.raises(JaxsrError, match=message):
         crop(scene(2), x, y, (h, w))
+
+
+@pytest.mark.parametrize(("horizontal", "vertical"), FLIPS)
+def test_jitter_of_hr_buffers_is_mirrored_like_that_of_the_image(horizontal, vertical):
+    window = scene()
+    jitter = np.float32([[0.5, -0.25], [0.125, 1.0]])
+    window = window._replace(frames=window.frames._replace(hr_jitter_px=jitter))
+    part = flip(crop(window, 4, 4, (8, 8)), horizontal=horizontal, vertical=vertical)
+    signs = [-1 if horizontal else 1, -1 if vertical else 1]
+    np.testing.assert_array_equal(part.frames.hr_jitter_px, jitter * signs)

@@ -338,3 +338,21 @@ def test_counts_are_checked_before_anything_is_read(folders):
     write_folder(folders / "bad", numbers=(1, 2))
     with pytest.raises(JaxsrError, match="frame 3 is missing"):
         check_match(find_frames(folders / "bad"), find_frames(folders / "truth"))
+
+
+def test_the_layer_of_a_sequence_that_frames_are_compared_with(tmp_path, folders):
+    """The reference by default, the colour on demand; a folder of pictures has no layers."""
+    sequence = make_sequence(tmp_path / "s", frames=2, size=(W, H), reference=True)
+    made = tmp_path / "made"
+    made.mkdir()
+    for i in range(2):
+        write_png(made / f"{i + 1:04d}.png", np.asarray(to_display(sequence.truth(i, "reference"))))
+    psnr = {}
+    for layer in (None, "color"):
+        section = compare([made], sequence.path, tmp_path / "out", layer=layer)
+        assert section.meta["layer"] == (layer or "reference")
+        psnr[layer] = section.methods[0].metrics["psnr"]
+    assert min(psnr[None]) > 50
+    assert max(psnr["color"]) < 30
+    with pytest.raises(JaxsrError, match="truth is no sequence: it has no layers"):
+        compare([folders / "exact"], folders / "truth", tmp_path / "out", layer="reference")

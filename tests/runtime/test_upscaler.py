@@ -122,6 +122,15 @@ class TestErrors:
             call(*arguments, **options)
         assert "\n" not in str(caught.value)
 
+    def test_of_jittered_hr_buffers(self):
+        """Only those methods take them that account for them."""
+        frame = analytic.frame(0, SIZE, 2, (0.1, 0.2), hr_jitter_px=(0.25, -0.5))[0]
+        up = loaded("guided")
+        self.line(r"guided: the method does not account for jittered HR buffers", up, frame, None)
+        up = loaded("guided-taau")
+        image, _ = up(frame, up.init(frame))
+        assert np.isfinite(np.asarray(image)).all()
+
     def test_of_load(self):
         self.line("unknown method 'nope'; expected one of nearest", jaxsr.load, "nope", scale=2)
         self.line("no weights of 'fusion-sr' for scale 3", jaxsr.load, "fusion-sr", scale=3)
