@@ -18,6 +18,8 @@ each pixel: it is as aliased as the G-buffer. The second history, that of the im
     beta  = the sum of their weights                Gaussians of `pixel_sigma`, and of `sample_sigma`
     b     = mean of C with `smooth_sigma`
 
+The samples lie beside p, and so does the centre m of their weights: c is moved to p by the slope of b, c - b' m.
+
 The HR buffers are best jittered themselves, by J_hr (`Frame.hr_jitter_px`), as those of an engine are that
 renders them with the jittered projection: then also an image at rest is sampled at many places in each pixel.
 What the filter gets wrong (highlights, light that changes within few pixels) the LR samples put right over
@@ -98,6 +100,8 @@ class Antialiasing(Accumulation):
     box: float = 1.4
     rest_box: float = 8.0
     smooth: float = 2.0
+    centred: float = 1.0
+    """Share of the slope of b that moves the mean of the samples from their place to that of the pixel."""
     depth_tolerance: float = 0.05
     dilated: bool = True
 
@@ -238,6 +242,7 @@ def pixels(
     jitter = frame.hr_jitter_px - jnp.round(frame.hr_jitter_px)
     shift = -jnp.round(frame.hr_jitter_px).astype(jnp.int32)
     total, sum_, wide, smooth = (jnp.zeros_like(x) for x in (color[..., :1], color, color[..., :1], color))
+    offset = jnp.zeros_like(color[..., :2])
     low, high = jnp.full_like(color, jnp.inf), jnp.full_like(color, -jnp.inf)
     values = color if trust is None else jnp.concatenate([color, trust], -1)
     for dy in (-1, 0, 1):
@@ -247,32 +252,37 @@ def pixels(
             squared = (dx + jitter[0]) ** 2 + (dy + jitter[1]) ** 2
             near = worth * jnp.exp(-squared / (2 * options.pixel_sigma**2))
             total, sum_ = total + near, sum_ + near * sample
+            offset = offset + near * jnp.stack([dx + jitter[0], dy + jitter[1]])[None, None]
             near = jnp.exp(-squared / (2 * options.smooth_sigma**2))
             wide, smooth = wide + near, smooth + near * sample
             low, high = jnp.minimum(low, sample), jnp.maximum(high, sample)
     smooth = smooth / wide
     if trust is None:
-        sample, weight = nearest_sample(frame, options)
-        total, sum_ = total + weight, sum_ + weight * sample
+        sample, weight, away = nearest_sample(frame, options)
+        total, sum_, offset = total + weight, sum_ + weight * sample, offset + weight * away
+    if options.centred:
+        slope_x, slope_y = _slopes(smooth)
+        sum_ = sum_ - options.centred * (slope_x * offset[..., :1] + slope_y * offset[..., 1:])
     color = jnp.where(total > 1e-6, sum_ / jnp.maximum(total, 1e-6), smooth)
     return Estimate(color, low, high, total, smooth)
 
 
 def nearest_sample(
     frame: Frame, options: Antialiasing
-) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 1"]]:
-    """The LR sample nearest to each HR pixel, in working space, and its weight."""
+) -> tuple[Float[Array, "H W 3"], Float[Array, "H W 1"], Float[Array, "H W 2"]]:
+    """The LR sample nearest to each HR pixel, in working space, its weight, and its way from the pixel."""
     image, scale = to_working(frame.color_linear, frame.exposure), frame.scale
 
     def nearest(axis: int) -> tuple[Array, Array]:  # index of the sample, and square of its distance
         at = (jnp.arange(frame.size[axis], dtype=image.dtype) + 0.5) / scale - 0.5 - frame.jitter_px[1 - axis]
         index = jnp.clip(jnp.round(at), 0, image.shape[axis] - 1)
-        return index.astype(jnp.int32), (scale * (index - at)) ** 2
+        return index.astype(jnp.int32), scale * (index - at)
 
     (rows, down), (columns, right) = nearest(0), nearest(1)
-    squared = down[:, None, None] + right[None, :, None]
+    away = jnp.stack(jnp.meshgrid(right, down), -1)
+    squared = jnp.sum(away**2, -1, keepdims=True)
     weight = options.sample_weight * jnp.exp(-squared / (2 * options.sample_sigma**2))
-    return image[rows][:, columns], weight
+    return image[rows][:, columns], weight, away
 
 
 def antialiased(
@@ -292,6 +302,13 @@ def antialiased(
     history, count, image = accumulate(before, count, now, options, is_moving(frame.hr.motion_px))
     kept = from_working(history, frame.exposure)
     return State(keep(color, frame), weight, kept, count), from_working(image, frame.exposure)
+
+
+def _slopes(image: Float[Array, "H W c"]) -> tuple[Float[Array, "H W c"], Float[Array, "H W c"]]:
+    """Change per pixel along x and y, by central differences."""
+    across = jnp.pad(image, ((0, 0), (1, 1), (0, 0)), mode="edge")
+    along = jnp.pad(image, ((1, 1), (0, 0), (0, 0)), mode="edge")
+    return 0.5 * (across[:, 2:] - across[:, :-2]), 0.5 * (along[2:] - along[:-2])
 
 
 def _shifted(image: Float[Array, "H W c"], dy: Array, dx: Array) -> Float[Array, "H W c"]:

@@ -167,6 +167,6 @@ def method(options: Options | None = None, loss: Loss | None = None) -> Method:
         Needs(needs, base.needs.extrapolated, hr_jitter=True),
         base.init,
         upscale,
-        base.extrapolate,
+        lambda net, state, frame: base.extrapolate(None, state, frame),
         Network(new, loss_of, Windows(LENGTH, made=None), to_json(o), to_json(weights)),
     )
