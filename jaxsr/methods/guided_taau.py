@@ -18,7 +18,8 @@ each pixel: it is as aliased as the G-buffer. The second history, that of the im
     beta  = the sum of their weights                Gaussians of `pixel_sigma`, and of `sample_sigma`
     b     = mean of C with `smooth_sigma`
 
-The samples lie beside p, and so does the centre m of their weights: c is moved to p by the slope of b, c - b' m.
+The samples lie beside p, and so does the centre m of their weights: c is moved to p by the slope of b, c - b'
+m.
 
 The HR buffers are best jittered themselves, by J_hr (`Frame.hr_jitter_px`), as those of an engine are that
 renders them with the jittered projection: then also an image at rest is sampled at many places in each pixel.

@@ -1,7 +1,5 @@
 """The history of the image: what the samples of a frame say of each pixel, and where it converges to."""
 
-import functools
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -56,9 +54,8 @@ def pixels_by_loop(color, frame, options, trust=None):
                 total, centre = total + near, centre + near * away
                 color_sum = color_sum + near * low_res[int(index[1]), int(index[0])]
             smooth = smooth / wide
-            values = color_sum / total if total > 1e-6 else smooth
             for image, value in zip(
-                out, (values, np.min(box, 0), np.max(box, 0), total, smooth), strict=True
+                out, (color_sum, np.min(box, 0), np.max(box, 0), total, smooth), strict=True
             ):
                 image[y, x] = value
             centres[y, x] = centre
@@ -85,54 +82,73 @@ def test_pixels_equal_the_loop(hr_jitter, trusted):
         np.testing.assert_allclose(getattr(found, name), expected, rtol=2e-5, atol=2e-6, err_msg=name)
 
 
-@functools.cache
-def still(scale: int, jittered: bool, count: int = 12) -> tuple[list[Frame], np.ndarray]:
-    """A camera at rest, and what an area average of many samples shows."""
-    jitters = np.asarray(jitter_sequence(count, count))
+def wall(scale: int, jittered: bool, count: int = 12) -> list[Frame]:
+    """A wall at rest with stripes of 0.9 periods per HR pixel, under constant light: its mean is 0.5."""
+
+    def stripes(size, step, jitter):
+        x = (np.arange(size[0]) + 0.5 + jitter[0]) * step - 0.5
+        row = 0.5 + 0.4 * np.sin(2 * np.pi * 0.9 * x)
+        return np.broadcast_to(row[None, :, None], (size[1], size[0], 3)).astype(np.float32)
+
     frames = []
-    for t in range(count):
-        jitter = tuple(map(float, jitters[t]))
-        frame, _ = analytic.frame(0, SIZE, scale, jitter, hr_jitter_px=jitter if jittered else (0.0, 0.0))
-        zero = np.zeros_like
+    for t, jitter in enumerate(np.asarray(jitter_sequence(count, count))):
+        own = tuple(map(float, jitter)) if jittered else (0.0, 0.0)
+        small = (SIZE[0] // scale, SIZE[1] // scale)
+        layers = {}
+        for place, size, step, j in (("lr", small, scale, jitter), ("hr", SIZE, 1, own)):
+            shape = size[::-1]
+            layers[place] = {
+                "base_color": stripes(size, step, j),
+                "normal": np.broadcast_to(np.float32([0, 0, 1]), (*shape, 3)),
+                "depth": np.full((*shape, 1), 5, np.float32),
+                "motion": np.zeros((*shape, 2), np.float32),
+            }
         frames.append(
-            frame._replace(
-                hr=frame.hr._replace(motion_px=zero(frame.hr.motion_px)),
-                lr=frame.lr._replace(motion_px=zero(frame.lr.motion_px)),
-                reset=np.asarray(t == 0),
+            Frame.of(
+                layers["lr"]["base_color"],
+                jitter=tuple(map(float, jitter)),
+                hr_jitter=own,
+                reset=t == 0,
+                lr=layers["lr"],
+                hr=layers["hr"],
             )
         )
-    fine = analytic.render(0, (SIZE[0] * 8, SIZE[1] * 8))["color"]
-    shown = np.asarray(to_display(fine)).reshape(SIZE[1], 8, SIZE[0], 8, 3).mean((1, 3))
-    return frames, shown
-
-
-def psnr_of_last(name: str, scale: int, jittered: bool) -> float:
-    frames, truth = still(scale, jittered)
-    *_, last = stream(METHODS[name], frames)
-    error = np.asarray(to_display(last.image)) - truth
-    return float(-10 * np.log10(np.mean(error**2)))
+    return frames
 
 
 @pytest.mark.parametrize("scale", [2, 4])
-def test_at_rest_jittered_buffers_remove_the_aliasing(scale):
-    assert psnr_of_last("guided-taau", scale, True) > psnr_of_last("guided-taau", scale, False) + 1.0
-    assert psnr_of_last("guided-taau", scale, True) > psnr_of_last("taau", scale, False) + 0.5
+def test_at_rest_jittered_buffers_remove_aliasing(scale):
+    def ripple(jittered):
+        *_, last = stream(METHODS["guided-taau"], wall(scale, jittered))
+        return float(np.std(np.asarray(to_display(last.image))[4:-4, 4:-4]))
+
+    assert ripple(False) > 0.05  # samples at the same places for ever
+    assert ripple(True) < 0.4 * ripple(False)
 
 
 def test_a_still_scene_stays_where_it_is():
-    """The image moves by less than 0.05 pixels while the jitter of both buffers moves by up to one."""
-    frames, _ = still(2, True)
-    images = [np.asarray(to_display(made.image)) for made in stream(METHODS["guided-taau"], frames)]
-    before, after = images[-2].mean(-1), images[-1].mean(-1)
-    slopes = np.stack(np.gradient(after), -1)[2:-2, 2:-2].reshape(-1, 2)
-    change = (after - before)[2:-2, 2:-2].reshape(-1)
+    """Over the last frames the image moves by less than 0.05 pixels, while both jitters move by up to one."""
+    jitters = np.asarray(jitter_sequence(16, 16))
+    frames = []
+    for t in range(16):
+        jitter = tuple(map(float, jitters[t]))
+        frame, _ = analytic.frame(0, (96, 54), 2, jitter, hr_jitter_px=jitter)
+        frames.append(
+            frame._replace(
+                hr=frame.hr._replace(motion_px=np.zeros_like(frame.hr.motion_px)),
+                lr=frame.lr._replace(motion_px=np.zeros_like(frame.lr.motion_px)),
+                reset=np.asarray(t == 0),
+            )
+        )
+    images = [np.asarray(to_display(made.image)).mean(-1) for made in stream(METHODS["guided-taau"], frames)]
+    slopes = np.stack(np.gradient(images[-1]), -1)[2:-2, 2:-2].reshape(-1, 2)
+    change = (images[-1] - images[-2])[2:-2, 2:-2].reshape(-1)
     shift, *_ = np.linalg.lstsq(slopes, change, rcond=None)
     assert np.abs(shift).max() < 0.05
 
 
 def test_buffers_with_the_projection_of_the_lr_frame():
     """An engine jitters HR buffers by the scale times J, which may exceed a pixel."""
-    frames, _ = still(4, False)
     jitter = (0.4, -0.3)
     large = analytic.frame(0, SIZE, 4, jitter, hr_jitter_px=(1.6, -1.2))[0]
     small = analytic.frame(0, SIZE, 4, jitter, hr_jitter_px=(0.0, 0.0))[0]
@@ -141,7 +157,6 @@ def test_buffers_with_the_projection_of_the_lr_frame():
     assert np.sqrt(np.mean((a - b) ** 2)) < 0.06  # other samples of the same picture, and not another place
     shifted = np.asarray(to_display(images[0]))[4:-4, 3:-5]
     assert np.mean((shifted - b) ** 2) > np.mean((a - b) ** 2)
-    assert len(frames) == 12
 
 
 @pytest.mark.parametrize("name", ["guided", "fusion-sr"])
