@@ -20,8 +20,10 @@ from jaxsr.report.video import write_video
 from jaxsr.runtime.load import find_method, shipped_scales
 
 UPSCALERS = ("nearest", "bilinear", "bicubic", "taau", "guided-taau")
-LEARNED = "fusion-sr"
-"""Upscales too, where its weights ship for the scale."""
+LEARNED = ("fusion-sr", "guided-unet")
+"""Those of them upscale too whose weights ship for the scale; the last one is shown in the videos."""
+WARMUP = 4
+"""Frames at the start that only fill histories, if the sequence has twice as many."""
 EXTRAPOLATORS = ("nearest", "bilinear", "taau", "guided", "guided-taau")
 
 
@@ -55,8 +57,9 @@ def run_demo(
     """
     check_results_folder(out)
     opened = [FrameSequence.open(path) for path in sequences]
-    upscalers = (*UPSCALERS, LEARNED) if scale in shipped_scales(LEARNED) else UPSCALERS
-    rivals = ("taau", LEARNED) if LEARNED in upscalers else ("bilinear", "guided-taau")
+    learned = [name for name in LEARNED if scale in shipped_scales(name)]
+    upscalers = (*UPSCALERS, *learned)
+    rivals = ("taau", learned[-1]) if learned else ("bilinear", "guided-taau")
     tasks = (
         _Task("super-resolution", 1, upscalers, rivals),
         _Task("extrapolation", 2, EXTRAPOLATORS, ("taau", "guided-taau")),
@@ -68,7 +71,8 @@ def run_demo(
     for sequence in opened:
         reference = Reference(sequence, truth=truth)
         for task in tasks:
-            settings = Settings(scale, task.every, metrics=metrics_with(lpips))
+            warmup = min(WARMUP, len(sequence) // 2)
+            settings = Settings(scale, task.every, warmup, metrics_with(lpips))
             sections.append(
                 run_methods(
                     Evaluation(sequence, settings, reference, advance),
