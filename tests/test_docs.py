@@ -31,22 +31,23 @@ def test_results_are_those_of_the_committed_run():
 
 
 def test_better_methods_are_better_on_every_scene_and_scale():
-    """The claims of README: temporal over interpolated, guided over the plain warp, the network over all."""
+    """The claims of README, against the anti-aliased reference: temporal over interpolated, guided over the
+    plain warp, guided-taau at least half a decibel over TAAU, the network that corrects it over all."""
     document = json.loads((ROOT / "experiments/results/demo.json").read_text())
     assert len(document["sections"]) == 12
     for section in document["sections"]:
         subset = "extrapolated" if any(section["extrapolated"]) else "all"
         psnr = {t["name"]: t["summary"][subset]["psnr"]["mean"] for t in section["tracks"]}
         assert psnr["taau"] > max(psnr["nearest"], psnr["bilinear"])
-        assert psnr["guided-taau"] > psnr["taau"]
+        assert section["meta"]["truth"] == "reference"
+        assert psnr["guided-taau"] > psnr["taau"] + 0.5
         if subset == "extrapolated":
             assert psnr["guided"] > psnr["taau"]
         else:
             by_name = {t["name"]: t["summary"][subset] for t in section["tracks"]}
-            network, others = by_name.pop("fusion-sr"), by_name.values()
+            network, others = by_name.pop("guided-unet"), by_name.values()
             assert network["psnr"]["mean"] > max(o["psnr"]["mean"] for o in others)
             assert network["ssim"]["mean"] > max(o["ssim"]["mean"] for o in others)
-            assert network["lpips"]["mean"] < min(o["lpips"]["mean"] for o in others)
 
 
 def test_pictures_of_frames_in_memory_and_on_disk_are_alike(tmp_path):

@@ -234,16 +234,16 @@ def test_ranges_rendered_one_after_the_other_are_joined(tmp_path, imitation):
     scene, out = tmp_path / "a.blend", tmp_path / "out"
     scene.write_bytes(b"")
 
-    def cuts(first, last):
+    def resets(first, last):
         seq = Sequence.open(render(scene, out, (first, last), scales=(), blender=imitation))
         return {i.index: i.reset for i in seq.infos}
 
-    assert cuts(3, 6) == {3: True, 4: False, 5: True, 6: False}
+    assert resets(3, 6) == {3: True, 4: False, 5: True, 6: False}
     before = (out / "hr" / "0004.exr").stat().st_mtime_ns
-    assert cuts(1, 6) == {1: True, 2: False, 3: False, 4: False, 5: True, 6: False}
+    assert resets(1, 6) == {1: True, 2: False, 3: False, 4: False, 5: True, 6: False}
     assert (out / "hr" / "0004.exr").stat().st_mtime_ns == before, "what is whole is kept"
-    assert cuts(7, 8) == {1: True, 2: False, 3: False, 4: False, 5: True, 6: False, 7: False, 8: False}
-    assert cuts(10, 10)[10]
+    assert resets(7, 8) == {1: True, 2: False, 3: False, 4: False, 5: True, 6: False, 7: False, 8: False}
+    assert resets(10, 10)[10]
 
 
 def test_failures_before_the_first_frame_leave_nothing(tmp_path, imitation):

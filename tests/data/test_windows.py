@@ -25,7 +25,7 @@ def source_of(*sequences, needs=COLOR, windows=Windows(), scale=2, **options):  
 
 
 def cut_at(seq, *indices):
-    """Mark frames as cuts in the description."""
+    """Mark frames as resets in the description."""
     file = seq.path / "sequence.json"
     head = json.loads(file.read_text())
     for frame in head["frames"]:

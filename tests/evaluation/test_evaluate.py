@@ -419,10 +419,10 @@ def test_other_refusals(data, tmp_path):
 
 def test_a_range_begins_anew(data):
     sequence = upscale.FrameSequence.open(data / "set" / "two")
-    cut = part(sequence, (2, 3))
-    assert [(info.index, info.reset) for info in cut.infos] == [(2, True), (3, False)]
+    some = part(sequence, (2, 3))
+    assert [(info.index, info.reset) for info in some.infos] == [(2, True), (3, False)]
     assert not sequence.infos[1].reset
-    assert cut.infos[1] is sequence.infos[2]
+    assert some.infos[1] is sequence.infos[2]
 
 
 def test_temporal_psnr_does_not_reach_across_a_cut(data, tmp_path):

@@ -299,12 +299,12 @@ def test_a_broken_pixel_is_forgotten():
 # The loss.
 
 
-@pytest.mark.parametrize("cut", [False, True])
-def test_rrn_s_loss_is_over_every_frame_from_an_empty_past(cut):
+@pytest.mark.parametrize("reset", [False, True])
+def test_rrn_s_loss_is_over_every_frame_from_an_empty_past(reset):
     """As streaming makes them, whether or not the first frame of the window has a past that it leaves out."""
     net = drawn(lambda rngs: method_of("rrn").network.new(rngs))
     seen = [frame_at(t) for t in range(3)]
-    total, parts = method_of("rrn").network.loss(net, window(seen, cut))
+    total, parts = method_of("rrn").network.loss(net, window(seen, reset))
     pairs = zip(streamed("rrn"), seen, strict=False)
     errors = [np.abs(to_display(image) - to_display(truth)).mean() for image, (_, truth) in pairs]
     # Streaming clips to [0, 1], which the random network leaves.

@@ -66,8 +66,8 @@ def model_of(name):
 def frame_at(t, size=SIZE, scale=2, rendered=True, jitter=None):
     jitter = (0.3 - 0.2 * t, 0.1 * t - 0.4) if jitter is None else jitter
     frame, truth = analytic.frame(t, size, scale, jitter, rendered=rendered)
-    cut = jnp.asarray(t == 0)
-    return jax.tree.map(jnp.asarray, frame)._replace(reset=cut), jnp.asarray(truth)
+    first = jnp.asarray(t == 0)
+    return jax.tree.map(jnp.asarray, frame)._replace(reset=first), jnp.asarray(truth)
 
 
 def clip():

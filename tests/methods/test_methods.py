@@ -91,11 +91,11 @@ def test_an_extrapolated_frame_never_sees_its_colour(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_cut_drops_the_history(name):
+def test_a_reset_drops_the_history(name):
     frames, _ = clip(2, 4)
     alone = [made.image for made in stream(METHODS[name], frames[3:])]
     broken = [frames[0], frames[1], frames[3]._replace(reset=np.asarray(True))]
-    # Even a broken history must not reach through a cut.
+    # Even a broken history must not reach through a reset.
     broken[1] = broken[1]._replace(color_linear=np.full_like(broken[1].color_linear, np.nan))
     after = [made.image for made in stream(METHODS[name], broken)]
     np.testing.assert_array_equal(after[2], alone[0])

@@ -224,8 +224,8 @@ def model_of(name):
 def frame_at(t, size=SIZE, scale=2, rendered=True):
     jitter = tuple(float((a * (t + 1)) % 1 - 0.5) for a in (0.37, 0.71))
     frame, truth = analytic.frame(t, size, scale, jitter, rendered=rendered)
-    cut, exposure = jnp.asarray(t == 0), jnp.asarray(1 + 0.1 * t, jnp.float32)
-    return jax.tree.map(jnp.asarray, frame)._replace(reset=cut, exposure=exposure), jnp.asarray(truth)
+    first, exposure = jnp.asarray(t == 0), jnp.asarray(1 + 0.1 * t, jnp.float32)
+    return jax.tree.map(jnp.asarray, frame)._replace(reset=first, exposure=exposure), jnp.asarray(truth)
 
 
 def clip(count=5, unrendered=(), **options):

@@ -142,8 +142,8 @@ class TestErrors:
         first, second, *_ = frames
         state = up.init(first)
         self.line("guided-taau: the first frame is not rendered", up.init, second)
-        cut = second._replace(reset=np.asarray(True))
-        self.line("a frame that begins anew is not rendered", up, cut, state)
+        fresh = second._replace(reset=np.asarray(True))
+        self.line("a frame that begins anew is not rendered", up, fresh, state)
         for place, name in (("lr", "base_color"), ("hr", "normal")):
             bare = first._replace(**{place: getattr(first, place)._replace(**{name: None})})
             self.line(f"the frame lacks {place}.{name}; expected hr.base_color, ", up, bare, state)

@@ -16,6 +16,7 @@ import pytest
 
 from experiments.fusion_sr import release, train_released
 from experiments.fusion_sr.train_released import LOSS, OPTIONS, RUNS
+from experiments.guided_unet import release as guided_unet_release
 from jaxsr.data import analytic
 from jaxsr.data.sample import sample_folder
 from jaxsr.errors import JaxsrError
@@ -47,7 +48,7 @@ def numbers(name):
 
 
 def test_every_run_ships_and_nothing_else():
-    assert {file.stem for file in WEIGHTS.glob("*.safetensors")} == set(RUNS)
+    assert {file.stem for file in WEIGHTS.glob("*.safetensors")} == {*RUNS, *guided_unet_release.RUNS}
 
 
 @pytest.mark.parametrize("name", RUNS)
