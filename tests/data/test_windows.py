@@ -24,7 +24,7 @@ def source_of(*sequences, needs=COLOR, windows=Windows(), scale=2, **options):  
     return WindowSource(paths, needs, windows, scale=scale, cache=cache, **options)
 
 
-def cut_at(seq, *indices):
+def reset_at(seq, *indices):
     """Mark frames as resets in the description."""
     file = seq.path / "sequence.json"
     head = json.loads(file.read_text())
@@ -71,9 +71,9 @@ def test_windows_carry_the_jitter_of_hr_buffers(tmp_path):
 
 def test_windows_do_not_cross_cuts(tmp_path):
     a = make_sequence(tmp_path / "a", **SMALL, frames=6)
-    cut_at(a, 1, 4)
+    reset_at(a, 1, 4)
     b = make_sequence(tmp_path / "b", **SMALL, frames=3)
-    cut_at(b)  # not even the first: it has a past that was left out
+    reset_at(b)  # not even the first: it has a past that was left out
     source = source_of(a, b, windows=Windows(2))
     jitters = [np.float32(w.frames.jitter_px).tolist() for w in map(source.__getitem__, range(len(source)))]
     expected = [(a, 0), (a, 1), (a, 3), (a, 4), (b, 0), (b, 1)]

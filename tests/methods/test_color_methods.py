@@ -185,7 +185,7 @@ def test_an_extrapolated_frame_is_the_last_picture_warped(name):
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_cut_drops_the_history(name):
+def test_a_reset_drops_the_history(name):
     frames = clip()
     broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
     after = [frames[2]._replace(reset=jnp.asarray(True)), frames[3]]

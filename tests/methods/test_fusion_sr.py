@@ -258,7 +258,7 @@ def test_it_extrapolates_by_plain_warping_without_guides():
     np.testing.assert_allclose(second, backward_warp(first, frames[1].hr.motion_px), rtol=1e-4, atol=1e-5)
 
 
-def test_a_cut_drops_the_history():
+def test_a_reset_drops_the_history():
     frames = clip()
     broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
     after = frames[2]._replace(reset=jnp.asarray(True))

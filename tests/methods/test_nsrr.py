@@ -352,7 +352,7 @@ def test_the_state_keeps_its_size(name):
         assert jax.tree.map(lambda x: (x.shape, x.dtype), after) == shapes
 
 
-def test_after_a_cut_nothing_is_remembered():
+def test_after_a_reset_nothing_is_remembered():
     frames = clip()
     broken = frames[0]._replace(color_linear=jnp.full_like(frames[0].color_linear, jnp.nan))
     again = [frame._replace(reset=jnp.asarray(t == 0)) for t, frame in enumerate(frames[2:])]
