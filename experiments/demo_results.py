@@ -27,9 +27,11 @@ from jaxsr.files import atomic_path
 from jaxsr.io.images import write_png
 from jaxsr.io.truth import Truth
 from jaxsr.progress import Bars
+from jaxsr.report.documents import as_json
 from jaxsr.report.embedding import ImageOrPath, to_bytes
 from jaxsr.report.results import SequenceResult
-from jaxsr.report.tables import as_json, best, cell, duration, header, summary
+from jaxsr.report.scores import best, summary
+from jaxsr.report.tables import cell, duration, header
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path.insert(0, str(ROOT))

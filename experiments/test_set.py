@@ -28,7 +28,9 @@ from jaxsr.evaluation.running import TRUTH_WORDS, Settings  # noqa: E402
 from jaxsr.files import atomic_path  # noqa: E402
 from jaxsr.io.truth import TRUTHS, Truth  # noqa: E402
 from jaxsr.progress import Bars  # noqa: E402
-from jaxsr.report.tables import as_json, cell, header, summary  # noqa: E402
+from jaxsr.report.documents import as_json  # noqa: E402
+from jaxsr.report.scores import summary  # noqa: E402
+from jaxsr.report.tables import cell, header  # noqa: E402
 from jaxsr.runtime.load import shipped_scales  # noqa: E402
 
 RESULTS = ROOT / "experiments" / "results"

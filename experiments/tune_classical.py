@@ -43,6 +43,7 @@ from jaxsr.io.truth import Truth, choose_truth
 from jaxsr.methods import METHODS, Method, accumulation, guided, guided_taau, taau
 from jaxsr.methods.base import step as step_of
 from jaxsr.ops import backward_warp, demodulate, modulate, reproject, to_display
+from jaxsr.runtime.schedule import observed
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt

@@ -36,8 +36,10 @@ from jaxsr.io.exr import atomic_path  # noqa: E402
 from jaxsr.io.truth import Truth  # noqa: E402
 from jaxsr.methods import build  # noqa: E402
 from jaxsr.progress import Bars  # noqa: E402
+from jaxsr.report.documents import as_json  # noqa: E402
 from jaxsr.report.results import SequenceResult  # noqa: E402
-from jaxsr.report.tables import as_json, cell, header, summary  # noqa: E402
+from jaxsr.report.scores import summary  # noqa: E402
+from jaxsr.report.tables import cell, header  # noqa: E402
 from jaxsr.runtime.load import settings_of  # noqa: E402
 from jaxsr.weights.file import load_weights, new_header, save_weights  # noqa: E402
 

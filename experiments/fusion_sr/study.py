@@ -44,7 +44,7 @@ from jaxsr.io.truth import Truth  # noqa: E402
 from jaxsr.methods import LEARNED, Method, from_json, fusion_sr, to_json  # noqa: E402
 from jaxsr.methods.legacy import upgrade  # noqa: E402
 from jaxsr.progress import Bars  # noqa: E402
-from jaxsr.report.tables import json_value  # noqa: E402
+from jaxsr.report.documents import json_value  # noqa: E402
 from jaxsr.runtime.load import LoadedMethod, find_method  # noqa: E402
 from jaxsr.training.config import TrainConfig  # noqa: E402
 from jaxsr.training.loop import train  # noqa: E402

@@ -31,7 +31,7 @@ from jaxsr.evaluation.evaluate import evaluate  # noqa: E402
 from jaxsr.evaluation.running import TRUTH_WORDS, Settings  # noqa: E402
 from jaxsr.methods import guided_unet  # noqa: E402
 from jaxsr.progress import Bars  # noqa: E402
-from jaxsr.report.tables import as_json  # noqa: E402
+from jaxsr.report.documents import as_json  # noqa: E402
 from jaxsr.training.config import TrainConfig  # noqa: E402
 from jaxsr.training.loop import train  # noqa: E402
 from jaxsr.weights.file import load_weights, save_weights  # noqa: E402

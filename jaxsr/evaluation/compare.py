@@ -28,9 +28,9 @@ from jaxsr.io.truth import Truth as TruthLayer
 from jaxsr.io.truth import choose_truth
 from jaxsr.ops.color import to_display
 from jaxsr.progress import Advance, Progress, silent
+from jaxsr.report.documents import check_results_folder, write_metrics
 from jaxsr.report.page import write_report
 from jaxsr.report.results import MethodResult, SequenceResult
-from jaxsr.report.tables import check_results_folder, write_metrics
 
 _PLAIN = (".png", ".jpg", ".jpeg")
 _INNER = ("exr", "png")

@@ -12,10 +12,10 @@ from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.io.truth import Truth, choose_truth
 from jaxsr.progress import Progress
 from jaxsr.provenance import provenance
+from jaxsr.report.documents import check_results_folder, write_metrics
 from jaxsr.report.embedding import to_bytes
 from jaxsr.report.page import write_report
 from jaxsr.report.results import SequenceResult
-from jaxsr.report.tables import check_results_folder, write_metrics
 from jaxsr.report.video import write_video
 from jaxsr.runtime.load import find_method, shipped_scales
 

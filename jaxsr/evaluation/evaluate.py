@@ -19,9 +19,9 @@ from jaxsr.io.find import find_sequences
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.io.truth import Truth, choose_truth
 from jaxsr.progress import Progress
+from jaxsr.report.documents import check_results_folder, write_metrics
 from jaxsr.report.page import write_report
 from jaxsr.report.results import SequenceResult
-from jaxsr.report.tables import check_results_folder, write_metrics
 from jaxsr.runtime.load import LoadedMethod, find_method
 from jaxsr.runtime.schedule import check_needs
 

@@ -27,8 +27,8 @@ from jaxsr.files import atomic_path, digest, file_digest, read_json, write_text
 from jaxsr.io.sequence import Sequence as FrameSequence
 from jaxsr.metrics import available
 from jaxsr.provenance import device, machine, versions
+from jaxsr.report.documents import json_value
 from jaxsr.report.results import MethodResult
-from jaxsr.report.tables import json_value
 from jaxsr.runtime.cost import Cost, Timing
 from jaxsr.runtime.load import LoadedMethod
 from jaxsr.runtime.record import check_folder, claim_folder, describe_run, frame_path, read_run
@@ -36,7 +36,16 @@ from jaxsr.runtime.record import check_folder, claim_folder, describe_run, frame
 RECORD = "result.json"
 FORMAT = "jaxsr-result"
 KINDS = ("exr", "png", "flip")
-NOT_CODE = ("cli.py", "training", "data", "inspection", "blender", "report/page.py", "report/tables.py")
+NOT_CODE = (
+    "cli.py",
+    "training",
+    "data",
+    "inspection",
+    "blender",
+    "report/page.py",
+    "report/tables.py",
+    "report/scores.py",
+)
 """Parts of the package that results do not depend on."""
 
 

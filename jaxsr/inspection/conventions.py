@@ -8,15 +8,15 @@ the HR one. Errors are capped, so that disocclusions and moving shadows do not d
 """
 
 import itertools
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from jaxsr.inspection import images
+from jaxsr.inspection.images import Layers
 from jaxsr.io.writing import FrameInfo
 from jaxsr.ops.pinhole import still_motion, unjittered_positions, view_rays, world_from_depth
 
-Layers = Mapping[str, np.ndarray]
 Size = tuple[int, int]
 
 UNITS = {
@@ -82,38 +82,6 @@ class MotionEvidence:
     """Median distance in pixels to the previous position of a static point."""
 
 
-def features(layers: Layers, scale: np.ndarray | None = None) -> np.ndarray:
-    """Properties that move with a surface: base colour (else log colour), normal, disparity; 0 for sky."""
-    planes = []
-    textured = "base_color" in layers and _gradient(layers["base_color"]).mean() > 1e-3
-    if textured:
-        planes.append(layers["base_color"])
-    elif "color" in layers:
-        planes.append(np.log1p(np.maximum(layers["color"], 0)))
-    if "normal" in layers:
-        planes.append(layers["normal"])
-    with np.errstate(divide="ignore"):
-        planes.append(np.where(is_sky(layers["depth"]), 0, 1 / layers["depth"]))
-    out = finite_or_zero(np.concatenate(planes, -1))
-    return out if scale is None else out * scale
-
-
-def finite_or_zero(x: np.ndarray) -> np.ndarray:
-    """float64, with 0 for NaN and Inf, which are counted elsewhere and must not stop this test."""
-    return np.nan_to_num(x.astype(np.float64), posinf=0, neginf=0)
-
-
-def is_sky(depth: np.ndarray) -> np.ndarray:
-    """`[H, W, 1]`: infinite depth, or a depth so large that it must mean sky."""
-    return ~(depth < 1e9)
-
-
-def normalise(current: np.ndarray) -> np.ndarray:
-    """Factors for each channel that make an error of 1 about one pixel of displacement; 0 for flat ones."""
-    step = _gradient(current).reshape(-1, current.shape[-1]).mean(0)
-    return np.where(step > 1e-4, 1 / np.maximum(step, 1e-4), 0) / max(int((step > 1e-4).sum()), 1)
-
-
 def motion_evidence(
     current: Layers,
     previous: Layers,
@@ -135,23 +103,23 @@ def motion_evidence(
         False: (current, previous, info, info_previous),
         True: (previous, current, info_previous, info),
     }
-    scale = normalise(_blur(features(current)))
-    solid = ~is_sky(current["depth"])[..., 0]
+    scale = images.normalise(images.blur(images.features(current)))
+    solid = ~images.is_sky(current["depth"])[..., 0]
     known = info.has_camera and info_previous.has_camera
     still_motion = static_motion(current["depth"], info, info_previous)[solid] if known else np.zeros((1, 2))
     evidence = MotionEvidence(
-        moves=bool(np.abs(finite_or_zero(current["motion"])).max(initial=0) > 1e-7),
+        moves=bool(np.abs(images.finite_or_zero(current["motion"])).max(initial=0) > 1e-7),
         camera_px=float(np.median(np.linalg.norm(still_motion, axis=-1))) if solid.any() else 0.0,
         image_change=0.0,
     )
     for forward, (here, there, info_here, info_there) in directions.items():
-        f_here, f_there = (_blur(features(x)) * scale for x in (here, there))
-        motion = finite_or_zero(here["motion"])
+        f_here, f_there = (images.blur(images.features(x)) * scale for x in (here, there))
+        motion = images.finite_or_zero(here["motion"])
         length = np.abs(motion).sum(-1)
-        moving = ~is_sky(here["depth"])[..., 0]
+        moving = ~images.is_sky(here["depth"])[..., 0]
         if (moving & (length > 0)).any():
             moving &= length >= 0.1 * np.quantile(length[moving & (length > 0)], 0.95)
-        p = _pick(moving & _interior(h, w), _gradient(f_here).sum(-1), samples)
+        p = images.pick(moving & images.interior(h, w), images.gradient(f_here).sum(-1), samples)
         if not len(p):
             continue
         target = f_here[p[:, 1], p[:, 0]]
@@ -160,7 +128,7 @@ def motion_evidence(
             expected = static_motion(here["depth"], info_here, info_there)[p[:, 1], p[:, 0]]
         # p - shift in the other image shows the same point as p.
         shift = np.asarray(jitter_delta) * (-1 if forward else 1)
-        still = _error(target, f_there, p - shift)
+        still = images.error(target, f_there, p - shift)
         cap = 2 * float(still.mean())
         none = float(np.minimum(still, cap).mean())
         if not forward:
@@ -170,8 +138,8 @@ def motion_evidence(
             if c.forward != forward:
                 continue
             vectors = c.to_pixels(motion[p[:, 1], p[:, 0]], (w, h)) * (-1 if forward else 1)
-            error = np.minimum(_error(target, f_there, p - vectors - shift), cap)
-            error[~_inside(p - vectors - shift, w, h)] = cap
+            error = np.minimum(images.error(target, f_there, p - vectors - shift), cap)
+            error[~images.inside(p - vectors - shift, w, h)] = cap
             evidence.image[c] = float(error.mean()) / none if none > 0 else 1.0
             evidence.camera[c] = float(np.median(np.linalg.norm(vectors - expected, axis=-1)))
     return evidence
@@ -179,7 +147,7 @@ def motion_evidence(
 
 def static_motion(depth: np.ndarray, info: FrameInfo, info_previous: FrameInfo) -> np.ndarray:
     """`[h, w, 2]`: backward motion, in pixels, of static points; 0 for sky."""
-    sky = is_sky(depth)
+    sky = images.is_sky(depth)
     return np.where(sky, 0, still_motion(np.where(sky, np.inf, depth), info, info_previous, xnp=np))
 
 
@@ -210,7 +178,7 @@ def camera_evidence(
         (camera, depth) -> error; 0 is perfect, 1 is as bad as no motion.
     """
     h, w = depth.shape[:2]
-    solid = ~is_sky(depth)[..., 0]
+    solid = ~images.is_sky(depth)[..., 0]
     if not solid.any():
         return {}
     rays = view_rays(unjittered_positions((h, w), None, np.float64, np), info, (h, w), np)
@@ -251,19 +219,19 @@ def jitter_evidence(
     lr = {k: v for k, v in lr.items() if k != "color"}  # colour may be noisy or lit differently
     hr = {k: v for k, v in hr.items() if k != "color"}
     shared = set(lr) & set(hr)
-    f_lr, f_hr = (features({k: x[k] for k in shared}) for x in (lr, hr))
+    f_lr, f_hr = (images.features({k: x[k] for k in shared}) for x in (lr, hr))
     if f_lr.shape[-1] != f_hr.shape[-1]:  # the base colour of one image has no texture
-        f_lr, f_hr = (features({k: x[k] for k in shared - {"base_color"}}) for x in (lr, hr))
-    weight = normalise(f_hr) / scale
+        f_lr, f_hr = (images.features({k: x[k] for k in shared - {"base_color"}}) for x in (lr, hr))
+    weight = images.normalise(f_hr) / scale
     f_lr, f_hr = f_lr * weight, f_hr * weight
     h, w = f_lr.shape[:2]
-    p = _pick(_interior(h, w), _gradient(f_lr).sum(-1), samples)
+    p = images.pick(images.interior(h, w), images.gradient(f_lr).sum(-1), samples)
     if not len(p) or not weight.any():
         return {}, None
     target = f_lr[p[:, 1], p[:, 0]]
 
     def residual(jitter: np.ndarray) -> np.ndarray:
-        return _bilinear(f_hr, (p + jitter + 0.5) * scale - 0.5) - target
+        return images.bilinear(f_hr, (p + jitter + 0.5) * scale - 0.5) - target
 
     def error(jitter: np.ndarray, cap: float) -> float:
         return float(np.minimum(np.abs(residual(jitter)).sum(-1), cap).mean())
@@ -273,12 +241,12 @@ def jitter_evidence(
     errors = {name: error(np.array(read(x, y, scale)), cap) for name, read in JITTERS.items()}
 
     best = np.array(JITTERS[min(errors, key=lambda n: errors[n])](x, y, scale))
-    slope = (_gradients(f_hr)) * scale
+    slope = (images.gradients(f_hr)) * scale
     for _ in range(8):  # Gauss-Newton on the pixels with the smaller errors
         r = residual(best)
         keep = np.abs(r).sum(-1) <= np.quantile(np.abs(r).sum(-1), 0.6)
         at = (p + best + 0.5) * scale - 0.5
-        g = np.stack([_bilinear(slope[k], at)[keep].ravel() for k in (0, 1)], -1)
+        g = np.stack([images.bilinear(slope[k], at)[keep].ravel() for k in (0, 1)], -1)
         step = np.linalg.lstsq(g, r[keep].ravel(), rcond=None)[0]
         best = np.clip(best - step, -1, 1)
         if np.abs(step).max() < 1e-4:
@@ -303,9 +271,9 @@ def lr_motion_evidence(
     grid = np.stack(np.meshgrid(np.arange(w), np.arange(h)), -1).reshape(-1, 2)
     at = np.rint((grid + jitter_px + 0.5) * scale - 0.5).astype(int)
     at = at.clip(0, (w * scale - 1, h * scale - 1))
-    m = finite_or_zero(hr["motion"])[at[:, 1], at[:, 0]]
-    stored = finite_or_zero(lr["motion"]).reshape(-1, 2)
-    solid = ~is_sky(lr["depth"]).ravel() & ~is_sky(hr["depth"])[at[:, 1], at[:, 0], 0]
+    m = images.finite_or_zero(hr["motion"])[at[:, 1], at[:, 0]]
+    stored = images.finite_or_zero(lr["motion"]).reshape(-1, 2)
+    solid = ~images.is_sky(lr["depth"]).ravel() & ~images.is_sky(hr["depth"])[at[:, 1], at[:, 0], 0]
     if not solid.any() or not np.abs(m[solid]).max() > 1e-7:
         return {}
     # MV_J,t = MV_N,t + J_{t-1} - J_t (docs/conventions.md)
@@ -328,10 +296,10 @@ NORMALS = {
 
 def normal_evidence(depth: np.ndarray, normal: np.ndarray, info: FrameInfo) -> dict[str, float]:
     """Median angle in degrees between stored normals, read in several ways, and the surface in the depth."""
-    position = world_from_depth(np.where(is_sky(depth), np.inf, depth), info, xnp=np)
+    position = world_from_depth(np.where(images.is_sky(depth), np.inf, depth), info, xnp=np)
     dx, dy = position[1:-1, 2:] - position[1:-1, :-2], position[2:, 1:-1] - position[:-2, 1:-1]
     surface = np.cross(dx, dy)
-    middle = np.where(is_sky(depth), np.inf, depth)[..., 0]
+    middle = np.where(images.is_sky(depth), np.inf, depth)[..., 0]
     with np.errstate(invalid="ignore", divide="ignore"):
         bend = [
             np.abs(1 / a + 1 / b - 2 / middle[1:-1, 1:-1]) * middle[1:-1, 1:-1]
@@ -344,63 +312,9 @@ def normal_evidence(depth: np.ndarray, normal: np.ndarray, info: FrameInfo) -> d
     surface, seen = surface[smooth], position[1:-1, 1:-1][smooth] - matrix[:3, 3]
     surface *= np.where(np.sum(surface * seen, -1, keepdims=True) > 0, -1, 1)
     surface /= np.maximum(np.linalg.norm(surface, axis=-1, keepdims=True), 1e-12)
-    stored, out = finite_or_zero(normal)[1:-1, 1:-1][smooth], {}
+    stored, out = images.finite_or_zero(normal)[1:-1, 1:-1][smooth], {}
     for name, read in NORMALS.items():
         n = read(stored, matrix[:3, :3])
         n = n / np.maximum(np.linalg.norm(n, axis=-1, keepdims=True), 1e-9)
         out[name] = float(np.degrees(np.median(np.arccos(np.clip(np.sum(n * surface, -1), -1, 1)))))
     return out
-
-
-def _blur(x: np.ndarray) -> np.ndarray:
-    """Two 3x3 binomials: point samples of fine texture alias, which would hide sub-pixel differences."""
-    for _ in range(2):
-        for axis in (0, 1):
-            padded = np.pad(x, [(1, 1) if a == axis else (0, 0) for a in range(3)], mode="edge")
-            n = x.shape[axis]
-            a, b, c = (np.take(padded, np.arange(k, k + n), axis) for k in range(3))
-            x = 0.25 * a + 0.5 * b + 0.25 * c
-    return x
-
-
-def _gradients(x: np.ndarray) -> np.ndarray:
-    """`[2, h, w, c]`: derivatives along x and y."""
-    return np.stack([np.gradient(x, axis=k) if x.shape[k] > 1 else np.zeros_like(x) for k in (1, 0)])
-
-
-def _gradient(x: np.ndarray) -> np.ndarray:
-    return np.abs(_gradients(finite_or_zero(x))).sum(0)
-
-
-def _interior(h: int, w: int) -> np.ndarray:
-    mask = np.zeros((h, w), bool)
-    mask[1:-1, 1:-1] = True
-    return mask
-
-
-def _pick(mask: np.ndarray, texture: np.ndarray, samples: int) -> np.ndarray:
-    """`[n, 2]` pixels (x, y): of the textured half of `mask`, at most `samples`, evenly by number."""
-    values = texture[mask]
-    if not values.size or values.max() <= 0:
-        return np.zeros((0, 2), int)
-    y, x = np.nonzero(mask & (texture >= np.median(values)) & (texture > 0))
-    take = np.random.default_rng(0).permutation(len(x))[:samples]
-    return np.stack([x[take], y[take]], -1)
-
-
-def _inside(p: np.ndarray, w: int, h: int) -> np.ndarray:
-    return np.all((p >= -0.5) & (p <= np.array([w, h]) - 0.5), -1)
-
-
-def _error(target: np.ndarray, image: np.ndarray, p: np.ndarray) -> np.ndarray:
-    return np.abs(_bilinear(image, p) - target).sum(-1)
-
-
-def _bilinear(image: np.ndarray, p: np.ndarray) -> np.ndarray:
-    h, w = image.shape[:2]
-    p = np.clip(p, 0, (w - 1, h - 1))
-    x0, y0 = np.minimum(p.astype(int), (max(w - 2, 0), max(h - 2, 0))).T
-    x1, y1 = np.minimum(x0 + 1, w - 1), np.minimum(y0 + 1, h - 1)
-    fx, fy = (p[:, 0] - x0)[:, None], (p[:, 1] - y0)[:, None]
-    top = image[y0, x0] * (1 - fx) + image[y0, x1] * fx
-    return top * (1 - fy) + (image[y1, x0] * (1 - fx) + image[y1, x1] * fx) * fy

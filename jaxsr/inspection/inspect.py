@@ -18,6 +18,7 @@ from rich.table import Table
 
 from jaxsr.errors import JaxsrError
 from jaxsr.inspection import conventions as cv
+from jaxsr.inspection.images import is_sky
 from jaxsr.inspection.verdicts import (
     BufferStats,
     Evidence,
@@ -188,7 +189,7 @@ def _read(sequence: Sequence, i: int, resolution: str, stats: dict) -> dict[str,
         if planes.keys() >= set(channels(layer))
     }
     images = {layer: np.stack([p.astype(np.float32) for p in of], -1) for layer, of in stored.items()}
-    sky = float(cv.is_sky(images["depth"]).mean()) if "depth" in images else 0.0
+    sky = float(is_sky(images["depth"]).mean()) if "depth" in images else 0.0
     for layer, x in images.items():
         size = f"{x.shape[1]}x{x.shape[0]}"
         new = BufferStats(resolution, layer, size, str(stored[layer][0].dtype))
@@ -235,10 +236,10 @@ def _single(sequence: Sequence, i: int, images: Mapping[str, Mapping[str, np.nda
     if not main:
         return
     finite = main["depth"][np.isfinite(main["depth"])]
-    if finite.size and np.isfinite(main["depth"]).all() and cv.is_sky(main["depth"]).any():
+    if finite.size and np.isfinite(main["depth"]).all() and is_sky(main["depth"]).any():
         to.sky_values.add(float(finite.max()))
     if "normal" in main:
-        solid = ~cv.is_sky(main["depth"])[..., 0]
+        solid = ~is_sky(main["depth"])[..., 0]
         if solid.any():
             length = np.linalg.norm(main["normal"][solid].astype(np.float64), axis=-1)
             to.normal_length.append(float(np.quantile(np.abs(length - 1), 0.9)))

@@ -12,6 +12,7 @@ from typing import Any, Literal
 import numpy as np
 
 from jaxsr.inspection import conventions as cv
+from jaxsr.inspection import images
 from jaxsr.io.sequence import Sequence
 
 Level = Literal["ok", "warn", "bad"]
@@ -205,7 +206,7 @@ def judge_camera(
     if not (sequence.infos[i].has_camera and sequence.infos[i - 1].has_camera):
         return Finding("camera and depth", "warn", "cannot tell: the camera is not known")
     h, w = hr["motion"].shape[:2]
-    motion = convention.to_pixels(cv.finite_or_zero(hr["motion"]), (w, h))
+    motion = convention.to_pixels(images.finite_or_zero(hr["motion"]), (w, h))
     errors = cv.camera_evidence(hr["depth"], motion, sequence.infos[i], sequence.infos[i - 1])
     if not errors:
         return Finding("camera and depth", "warn", "cannot tell: all is sky")

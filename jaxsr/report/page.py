@@ -23,9 +23,11 @@ from matplotlib import colormaps
 from jaxsr.errors import JaxsrError
 from jaxsr.files import atomic_path
 from jaxsr.metrics import METRICS
+from jaxsr.report.documents import json_value
 from jaxsr.report.embedding import Images, thinned
 from jaxsr.report.results import REGIONS, SequenceResult
-from jaxsr.report.tables import Scores, groups, json_value, mean_scores, rows, scores
+from jaxsr.report.scores import Scores, groups, mean_scores, scores
+from jaxsr.report.tables import rows
 
 MAX_MEGABYTES = 18.0
 """Default target for the size of the page."""

@@ -9,7 +9,8 @@ import pytest
 from rich.console import Console
 
 from jaxsr.data import analytic
-from jaxsr.inspection.conventions import CONVENTIONS, UNITS, MotionConvention, is_sky
+from jaxsr.inspection.conventions import CONVENTIONS, UNITS, MotionConvention
+from jaxsr.inspection.images import is_sky
 from jaxsr.inspection.inspect import inspect, print_report
 from jaxsr.io.exr import read_exr, write_exr
 from jaxsr.io.sequence import Sequence

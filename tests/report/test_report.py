@@ -21,18 +21,11 @@ from jaxsr.evaluation.measuring import measured
 from jaxsr.io.images import write_png
 from jaxsr.metrics import available
 from jaxsr.report import embedding
+from jaxsr.report.documents import as_csv, as_json, write_metrics
 from jaxsr.report.page import write_report
 from jaxsr.report.results import MethodResult, SequenceResult, Timing
-from jaxsr.report.tables import (
-    as_csv,
-    as_json,
-    best,
-    markdown,
-    rich_tables,
-    summarise,
-    summary,
-    write_metrics,
-)
+from jaxsr.report.scores import best, summarise, summary
+from jaxsr.report.tables import markdown, rich_tables
 
 H, W, N = 16, 24, 4
 
