@@ -247,7 +247,7 @@ def compare(
                 _measured(name, frames, true, starts, shown, Meter(keys), advance)
                 for name, frames in zip(names, given, strict=True)
             ],
-            exposure=exposures[0],
+            exposures=exposures,
             meta={
                 "truth": str(truth),
                 "layer": layer,

@@ -157,7 +157,7 @@ def run_methods(
         methods=results,
         inputs=[frame_path(out / "input", "png", indices[i]) if schedule[i] else None for i in measured],
         extrapolated=[not schedule[i] for i in measured] if settings.every > 1 else (),
-        exposure=sequence.exposure,
+        exposures=[sequence.exposure_at(i) for i in measured],
         meta={
             "scale": settings.scale,
             "every": settings.every,

@@ -76,7 +76,7 @@ def as_json(
                 "task": section.task,
                 "frames": section.frames,
                 "extrapolated": list(section.extrapolated) or [False] * len(section.frames),
-                "exposure": section.exposure,
+                "exposure": section.exposures[0] if len(set(section.exposures)) == 1 else section.exposures,
                 "meta": section.meta,
                 "tracks": results,
             }

@@ -248,14 +248,17 @@ def write_report(
         "fps": fps,
         "images": uris,
     }
-    exposures = sorted({s.exposure for s in sections})
+    exposures = sorted({exposure for s in sections for exposure in s.exposures})
+    shown = ", ".join(f"{e:g}" for e in exposures)
+    if len(exposures) > 4:
+        shown = f"{exposures[0]:g} to {exposures[-1]:g}, each frame its own"
     definitions = [
         (
             "Images",
             "display-referred. Linear colour (Rec. 709) is shown as sRGB(clip(ACES(colour × exposure))); "
             "PNG and JPEG frames are taken as they are",
         ),
-        ("Exposure", ", ".join(f"{e:g}" for e in exposures)),
+        ("Exposure", shown),
         ("Crop", "none: all pixels count, borders included"),
         *((METRICS[k].label, METRICS[k].definition) for k in keys),
         *((r.capitalize(), REGIONS[r]) for r in REGIONS if any(r in s.regions() for s in sections)),

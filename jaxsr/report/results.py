@@ -64,7 +64,8 @@ class SequenceResult:
     """The input of the methods at render size; None for a frame that was not rendered."""
     extrapolated: Sequence[bool] = ()
     """True for frames that every method had to extrapolate; empty if there are none."""
-    exposure: float = 1.0
+    exposures: Sequence[float] = (1.0,)
+    """Of the frames; linear colour was multiplied by it before the tone map. One for all will do."""
     meta: Mapping[str, Any] = field(default_factory=dict)
     task: str = ""
     """Sections with the same task are also averaged; an empty task is not."""

@@ -47,7 +47,7 @@ def sections():
         truths,
         [measured("Close", close, truths, timing=timing), measured("Far & <b>wide</b>", far, truths)],
         [t[::2, ::2] for t in truths],
-        exposure=1.5,
+        exposures=(1.5,),
     )
     half = SequenceResult(
         "hall, every second frame extrapolated",
