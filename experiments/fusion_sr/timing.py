@@ -287,7 +287,7 @@ def render_table(found: dict[str, Any], about: dict[str, Any], runtime: dict[str
     return [
         *lines,
         "",
-        f"CPU seconds, summed over cores: of Blender (Cycles, {about['samples']} samples a pixel, G-buffer "
+        f"CPU seconds, summed over cores: of Blender (Cycles, {about['samples']} samples per pixel, G-buffer "
         f"1; {about['device']}; commit {about['commit']}, {about['date']}), and of the network "
         f"({runtime['about']['device']}).",
     ]
