@@ -18,6 +18,8 @@ from jaxsr.io.writing import FrameInfo
 from jaxsr.ops.pinhole import still_motion, unjittered_positions, view_rays, world_from_depth
 
 Size = tuple[int, int]
+FLAT_PX = 0.02
+"""Warp error without motion below which a kind of channel hardly changes."""
 
 UNITS = {
     "pixels": lambda w, h: (1.0, 1.0),
@@ -80,6 +82,8 @@ class MotionEvidence:
     """Warp error relative to no motion."""
     camera: dict[MotionConvention, float] = field(default_factory=dict)
     """Median distance in pixels to the previous position of a static point."""
+    kind: str = ""
+    """Which of `images.kinds` tells most, and so decided `image`."""
 
 
 def motion_evidence(
@@ -112,6 +116,9 @@ def motion_evidence(
         camera_px=float(np.median(np.linalg.norm(still_motion, axis=-1))) if solid.any() else 0.0,
         image_change=0.0,
     )
+    parts = images.channels_of(current)
+    judged: dict[str, dict[MotionConvention, float]] = {name: {} for name in parts}
+    changes = dict.fromkeys(parts, 0.0)
     for forward, (here, there, info_here, info_there) in directions.items():
         f_here, f_there = (images.blur(images.features(x)) * scale for x in (here, there))
         motion = images.finite_or_zero(here["motion"])
@@ -122,27 +129,55 @@ def motion_evidence(
         p = images.pick(moving & images.interior(h, w), images.gradient(f_here).sum(-1), samples)
         if not len(p):
             continue
-        target = f_here[p[:, 1], p[:, 0]]
         expected = np.full((len(p), 2), np.nan)
         if known:
             expected = static_motion(here["depth"], info_here, info_there)[p[:, 1], p[:, 0]]
         # p - shift in the other image shows the same point as p.
         shift = np.asarray(jitter_delta) * (-1 if forward else 1)
-        still = images.error(target, f_there, p - shift)
-        cap = 2 * float(still.mean())
-        none = float(np.minimum(still, cap).mean())
         if not forward:
             evidence.camera_px = float(np.median(np.linalg.norm(expected, axis=-1))) if known else 0.0
-            evidence.image_change = none
         for c in CONVENTIONS:
-            if c.forward != forward:
-                continue
-            vectors = c.to_pixels(motion[p[:, 1], p[:, 0]], (w, h)) * (-1 if forward else 1)
-            error = np.minimum(images.error(target, f_there, p - vectors - shift), cap)
-            error[~images.inside(p - vectors - shift, w, h)] = cap
-            evidence.image[c] = float(error.mean()) / none if none > 0 else 1.0
-            evidence.camera[c] = float(np.median(np.linalg.norm(vectors - expected, axis=-1)))
+            if c.forward == forward:
+                vectors = c.to_pixels(motion[p[:, 1], p[:, 0]], (w, h)) * (-1 if forward else 1)
+                evidence.camera[c] = float(np.median(np.linalg.norm(vectors - expected, axis=-1)))
+        for name, part in parts.items():
+            errors, none = _relative_errors(f_here[..., part], f_there[..., part], motion, p, shift, forward)
+            judged[name] |= errors
+            if not forward:
+                changes[name] = none
+    complete = [name for name in parts if len(judged[name]) == len(CONVENTIONS)]
+    if complete:
+        # Depth in few codes, or depth that changes because the camera advances, fits no reading: it must not
+        # outvote colour. A kind that hardly changes says nothing.
+        telling = [name for name in complete if changes[name] > FLAT_PX] or complete
+        evidence.kind = min(telling, key=lambda name: min(judged[name].values()))
+        evidence.image, evidence.image_change = judged[evidence.kind], changes[evidence.kind]
     return evidence
+
+
+def _relative_errors(
+    here: np.ndarray,
+    there: np.ndarray,
+    motion: np.ndarray,
+    p: np.ndarray,
+    shift: np.ndarray,
+    forward: bool,
+) -> tuple[dict[MotionConvention, float], float]:
+    """Warp errors of each convention relative to no motion, in some channels; and that of no motion."""
+    h, w = here.shape[:2]
+    target = here[p[:, 1], p[:, 0]]
+    still = images.error(target, there, p - shift)
+    cap = 2 * float(still.mean())
+    none = float(np.minimum(still, cap).mean())
+    errors = {}
+    for c in CONVENTIONS:
+        if c.forward != forward:
+            continue
+        vectors = c.to_pixels(motion[p[:, 1], p[:, 0]], (w, h)) * (-1 if forward else 1)
+        error = np.minimum(images.error(target, there, p - vectors - shift), cap)
+        error[~images.inside(p - vectors - shift, w, h)] = cap
+        errors[c] = float(error.mean()) / none if none > 0 else 1.0
+    return errors, none
 
 
 def static_motion(depth: np.ndarray, info: FrameInfo, info_previous: FrameInfo) -> np.ndarray:

@@ -10,20 +10,34 @@ import numpy as np
 Layers = Mapping[str, np.ndarray]
 
 
-def features(layers: Layers, scale: np.ndarray | None = None) -> np.ndarray:
+def kinds(layers: Layers) -> dict[str, np.ndarray]:
     """Properties that move with a surface: base colour (else log colour), normal, disparity; 0 for sky."""
-    planes = []
+    found = {}
     textured = "base_color" in layers and gradient(layers["base_color"]).mean() > 1e-3
     if textured:
-        planes.append(layers["base_color"])
+        found["base colour"] = layers["base_color"]
     elif "color" in layers:
-        planes.append(np.log1p(np.maximum(layers["color"], 0)))
+        found["colour"] = np.log1p(np.maximum(layers["color"], 0))
     if "normal" in layers:
-        planes.append(layers["normal"])
+        found["normal"] = layers["normal"]
     with np.errstate(divide="ignore"):
-        planes.append(np.where(is_sky(layers["depth"]), 0, 1 / layers["depth"]))
-    out = finite_or_zero(np.concatenate(planes, -1))
+        found["disparity"] = np.where(is_sky(layers["depth"]), 0, 1 / layers["depth"])
+    return {name: finite_or_zero(x) for name, x in found.items()}
+
+
+def features(layers: Layers, scale: np.ndarray | None = None) -> np.ndarray:
+    """All `kinds` as channels."""
+    out = np.concatenate(list(kinds(layers).values()), -1)
     return out if scale is None else out * scale
+
+
+def channels_of(layers: Layers) -> dict[str, slice]:
+    """Where each of the `kinds` lies among the channels of `features`."""
+    ends, last = {}, 0
+    for name, x in kinds(layers).items():
+        ends[name] = slice(last, last + x.shape[-1])
+        last += x.shape[-1]
+    return ends
 
 
 def finite_or_zero(x: np.ndarray) -> np.ndarray:

@@ -5,6 +5,7 @@ Functions of `Evidence` (collected over the frames by `jaxsr.inspection.inspect`
 
 import dataclasses
 import math
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -172,9 +173,9 @@ def judge_motion(evidence: list[cv.MotionEvidence]) -> tuple[Finding, cv.MotionC
         return Finding("motion", "warn" if change < 0.05 else "bad", f"cannot tell: {texture}", data), None
     how = "sure" if sure else "not quite sure"
     text = (
-        f"{best.name} ({how}: {votes:.0%} of {len(scores)} pairs; the warp leaves "
-        f"{data['image_errors'][best.name]:.0%} of the difference; {second.name!r} is {min(margin, 999):.3g} "
-        "times worse)"
+        f"{best.name} ({how}: {votes:.0%} of {len(scores)} pairs; judged by {_decided(usable)}, the warp "
+        f"leaves {data['image_errors'][best.name]:.0%} of the difference; {second.name!r} is "
+        f"{min(margin, 999):.3g} times worse)"
     )
     if rivals:
         text += f"; as good: {' | '.join(c.name for c in rivals[:3])}"
@@ -182,6 +183,11 @@ def judge_motion(evidence: list[cv.MotionEvidence]) -> tuple[Finding, cv.MotionC
         text += f"; jaxsr takes it for {cv.CANONICAL.name}: convert it"
         return Finding("motion", "bad", text, data), best
     return Finding("motion", "ok" if sure else "warn", text, data), best
+
+
+def _decided(evidence: list[cv.MotionEvidence]) -> str:
+    """The kinds of channels that decided, the most frequent first."""
+    return ", ".join(kind for kind, _ in Counter(e.kind for e in evidence).most_common())
 
 
 def _scores(e: cv.MotionEvidence) -> dict[cv.MotionConvention, float]:
@@ -196,6 +202,10 @@ def _scores(e: cv.MotionEvidence) -> dict[cv.MotionConvention, float]:
     }
 
 
+STILL_PX = 0.01
+"""Motion in pixels below which a camera, or a point, stands still."""
+
+
 def judge_camera(
     sequence: Sequence, pairs: list[tuple[int, dict[str, np.ndarray]]], convention: cv.MotionConvention | None
 ) -> Finding:
@@ -207,6 +217,15 @@ def judge_camera(
         return Finding("camera and depth", "warn", "cannot tell: the camera is not known")
     h, w = hr["motion"].shape[:2]
     motion = convention.to_pixels(images.finite_or_zero(hr["motion"]), (w, h))
+    solid = ~images.is_sky(hr["depth"])[..., 0]
+    alone = cv.static_motion(hr["depth"], sequence.infos[i], sequence.infos[i - 1])[solid]
+    if solid.any() and np.linalg.norm(alone, axis=-1).max() < STILL_PX:
+        share = float(np.mean(np.linalg.norm(motion[solid], axis=-1) > STILL_PX))
+        data = {"camera": None, "depth": None, "moving": share}
+        text = f"the camera stands still, and {share:.0%} of the surface moves by itself"
+        if share > 0.5:  # a camera that was not exported looks like that
+            return Finding("camera and depth", "warn", f"{text}: is it the camera of each frame?", data)
+        return Finding("camera and depth", "ok", f"cannot tell: {text}", data)
     errors = cv.camera_evidence(hr["depth"], motion, sequence.infos[i], sequence.infos[i - 1])
     if not errors:
         return Finding("camera and depth", "warn", "cannot tell: all is sky")

@@ -492,3 +492,33 @@ def test_a_camera_that_is_not_rigid_is_found(tmp_path):
     assert (report.level, found.level) == ("bad", "bad")
     assert "frame 1: world_from_view is not rigid" in found.text
     assert "(and 1 more)" in found.text
+
+
+def coarse_depth(name, index, layers):
+    """Depth as 8-bit codes of each image's own range, and no other buffer than colour and motion."""
+    depth = layers["depth"]
+    near, far = depth[np.isfinite(depth)].min(), depth[np.isfinite(depth)].max()
+    codes = np.rint(np.clip((depth - near) / (far - near), 0, 1) * 255) * (1 + 0.2 * index)
+    layers["depth"] = np.where(np.isfinite(depth), near + codes / 255 * (far - near), np.inf).astype(
+        np.float32
+    )
+    del layers["base_color"], layers["normal"]
+
+
+def test_coarse_depth_does_not_outvote_colour(tmp_path):
+    seq = make_sequence(tmp_path / "s", frames=3, size=SIZE, scales=(), spoil=coarse_depth)
+    edit_frames(seq.path, lambda frame: frame.pop("camera"))
+    motion = inspect(Sequence.open(seq.path, check=False)).finding("motion")
+    assert motion.data["convention"] == "backward, pixels, y down"
+    assert "judged by colour" in motion.text
+    assert motion.data["error"] < 0.5  # of no motion
+    assert all("forward" in rival for rival in motion.data["rivals"])  # without a camera it may be either
+
+
+def test_a_camera_at_rest_is_said_to_be_that(tmp_path):
+    report = look(tmp_path, scales=(), still=True)
+    finding = report.finding("camera and depth")
+    assert finding.level == "ok"
+    assert "the camera stands still" in finding.text
+    assert "error" not in finding.text
+    assert 0 < finding.data["moving"] < 0.9
