@@ -309,7 +309,10 @@ def _slopes(image: Float[Array, "H W c"]) -> tuple[Float[Array, "H W c"], Float[
     """Change per pixel along x and y, by central differences."""
     across = jnp.pad(image, ((0, 0), (1, 1), (0, 0)), mode="edge")
     along = jnp.pad(image, ((1, 1), (0, 0), (0, 0)), mode="edge")
-    return 0.5 * (across[:, 2:] - across[:, :-2]), 0.5 * (along[2:] - along[:-2])
+    slopes = 0.5 * (across[:, 2:] - across[:, :-2]), 0.5 * (along[2:] - along[:-2])
+    return jnp.nan_to_num(slopes[0]), jnp.nan_to_num(
+        slopes[1]
+    )  # a broken pixel has no slope for its neighbours
 
 
 def _shifted(image: Float[Array, "H W c"], dy: Array, dx: Array) -> Float[Array, "H W c"]:
