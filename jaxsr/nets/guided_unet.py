@@ -6,7 +6,7 @@
     O   = shuffle(tail(F_0)) / 10
 
 `block(F) = F + conv(leaky(conv(F)))`. Most of the work is done at half the size, where each filter costs a
-quarter of what it costs at full size: 48 thousand multiply-adds per pixel with the default widths.
+quarter of what it costs at full size: 46 thousand multiply-adds per pixel with the default widths.
 
 Contract: `X` is `[B, H, W, C]` in about [-1, 1], the output `[B, H, W, 3]` float32, not clipped, for any H
 and W. The tail begins at 0: an untrained network corrects nothing. Its first steps are large all the same,
