@@ -221,11 +221,11 @@ def judge_camera(
     alone = cv.static_motion(hr["depth"], sequence.infos[i], sequence.infos[i - 1])[solid]
     if solid.any() and np.linalg.norm(alone, axis=-1).max() < STILL_PX:
         share = float(np.mean(np.linalg.norm(motion[solid], axis=-1) > STILL_PX))
-        data = {"camera": None, "depth": None, "moving": share}
+        seen: dict[str, Any] = {"camera": None, "depth": None, "moving": share}
         text = f"the camera stands still, and {share:.0%} of the surface moves by itself"
         if share > 0.5:  # a camera that was not exported looks like that
-            return Finding("camera and depth", "warn", f"{text}: is it the camera of each frame?", data)
-        return Finding("camera and depth", "ok", f"cannot tell: {text}", data)
+            return Finding("camera and depth", "warn", f"{text}: is it the camera of each frame?", seen)
+        return Finding("camera and depth", "ok", f"cannot tell: {text}", seen)
     errors = cv.camera_evidence(hr["depth"], motion, sequence.infos[i], sequence.infos[i - 1])
     if not errors:
         return Finding("camera and depth", "warn", "cannot tell: all is sky")
